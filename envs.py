@@ -1,0 +1,307 @@
+"""Sim and "real" in batches: gymnasium's MuJoCo tasks on `mujoco.batch`.
+
+    sim = BatchEnv("Hopper-v4", num_envs=32)
+    real = BatchEnv("Hopper-v4", num_envs=32, perturbation=parse_perturbation("torso:mass*1.27"))
+    obs, _ = sim.reset(seed=0)
+    obs, reward, terminated, truncated, info = sim.step(actions)   # info["next_obs"]: before any reset
+
+Every environment of a batch is one row of a `mujoco.batch.Batch`, so a step is one call on all cores.
+Observations, rewards, ends and resets equal `gymnasium.make(id)`, seed for seed.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium.envs import mujoco as gym_mujoco
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from mujoco.batch import Batch
+
+
+class EnvError(ValueError):
+    """A request about an environment that cannot be met; the message says what to do instead."""
+
+
+# --- the three tasks of the paper -------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Task:
+    """What gymnasium's environment class adds to the MJCF file.
+
+    xml, frame_skip: the model and the physics steps per action. skip_root_x: observations leave out qpos[0].
+    clip_velocity: bound on observed qvel. reset_noise: half-width of the uniform start noise; normal_qvel
+    draws qvel from a normal instead. forward_weight, ctrl_weight, healthy_reward: the reward's terms.
+    real: the perturbation that makes the paper's "real" world.
+    """
+
+    xml: str
+    frame_skip: int
+    reset_noise: float
+    real: str
+    skip_root_x: bool = True
+    clip_velocity: float = np.inf
+    normal_qvel: bool = False
+    forward_weight: float = 1.0
+    ctrl_weight: float = 0.0
+    healthy_reward: float = 0.0
+
+    def unhealthy(self, qpos, qvel):
+        """Which of the states (N, nq), (N, nv) end an episode: (N,) bool."""
+        return np.zeros(len(qpos), bool)
+
+
+class InvertedPendulum(Task):
+    def unhealthy(self, qpos, qvel):
+        finite = np.isfinite(qpos).all(1) & np.isfinite(qvel).all(1)
+        return ~finite | (np.abs(qpos[:, 1]) > 0.2)
+
+
+class Hopper(Task):
+    def unhealthy(self, qpos, qvel):
+        state = np.concatenate((qpos[:, 2:], qvel), axis=1)
+        healthy = ((-100.0 < state) & (state < 100.0)).all(1)
+        return ~(healthy & (0.7 < qpos[:, 1]) & (-0.2 < qpos[:, 2]) & (qpos[:, 2] < 0.2))
+
+
+TASKS = {
+    "InvertedPendulum": InvertedPendulum(
+        "inverted_pendulum.xml", 2, 0.01, "pole:mass=100", skip_root_x=False, forward_weight=0.0, healthy_reward=1.0
+    ),
+    "Hopper": Hopper("hopper.xml", 4, 5e-3, "torso:mass*1.27", clip_velocity=10.0, ctrl_weight=1e-3, healthy_reward=1.0),
+    "HalfCheetah": Task("half_cheetah.xml", 5, 0.1, "torso:mass*1.15", normal_qvel=True, ctrl_weight=0.1),
+}
+ENV_IDS = [f"{name}-{version}" for name in TASKS for version in ("v4", "v5")]
+TIME_LIMIT = 1000  # steps, as registered in gymnasium for all three
+
+
+def task_of(env_id):
+    """The Task of a gymnasium id such as "Hopper-v4". Raises EnvError for any other id."""
+    if env_id not in ENV_IDS:
+        raise EnvError(f"unknown environment {env_id!r}: choose one of {', '.join(ENV_IDS)}")
+    return TASKS[env_id.split("-")[0]]
+
+
+def model_path(env_id):
+    """Path of the MJCF file that gymnasium ships for env_id."""
+    return Path(gym_mujoco.__file__).parent / "assets" / task_of(env_id).xml
+
+
+# --- the "real" world: the sim with named changes ---------------------------------------------------
+
+JOINT_FIELDS = {"damping": "dof_damping", "frictionloss": "dof_frictionloss", "armature": "dof_armature"}
+FIELDS = ("mass", *JOINT_FIELDS, "gain", "gravity")
+
+
+@dataclass(frozen=True)
+class Change:
+    """One edit of a model: the field of the named body, joint or actuator is set to, or scaled by, value."""
+
+    name: str
+    field: str
+    op: str  # "=" sets, "*" scales
+    value: float
+
+    def of(self, old):
+        return self.value if self.op == "=" else old * self.value
+
+
+def parse_perturbation(text):
+    """"torso:mass*1.27,foot_joint:frictionloss=0.5" -> list of Change. Raises EnvError if it does not parse.
+
+    Fields: mass (of a body), damping, frictionloss, armature (of a joint), gain (of an actuator, or of the
+    actuator on a named joint), gravity ("world:gravity*0.9": the downward acceleration). "" is no change.
+    """
+    changes = []
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        match = re.fullmatch(r"([^:]+):(\w+)\s*([=*])\s*(\S+)", part)
+        try:
+            name, field, op, value = match.groups()
+            value = float(value)
+        except (AttributeError, ValueError):
+            raise EnvError(f"cannot read {part!r}: write NAME:FIELD=VALUE or NAME:FIELD*FACTOR, e.g. torso:mass*1.27") from None
+        if field not in FIELDS:
+            raise EnvError(f"unknown field {field!r} in {part!r}: choose one of {', '.join(FIELDS)}")
+        if not np.isfinite(value) or (field == "mass" and value <= 0) or (field in JOINT_FIELDS and value < 0):
+            raise EnvError(f"{part!r}: {value:g} is no possible {field}: give a finite {'positive ' if field == 'mass' else ''}number")
+        changes.append(Change(name.strip(), field, op, value))
+    return changes
+
+
+def _id_of(model, kind, change):
+    count = {"body": model.nbody, "joint": model.njnt, "actuator": model.nu}[kind]
+    names = [getattr(model, kind)(i).name for i in range(count)]
+    if change.name in names:
+        return names.index(change.name)
+    known = ", ".join(name for name in names if name and name != "world")
+    raise EnvError(f"no {kind} {change.name!r} for its {change.field}: choose one of {known}")
+
+
+def perturb(model, changes):
+    """Apply Changes to a compiled mujoco.MjModel in place. Raises EnvError for a name that it lacks.
+
+    Inertia scales along with mass, and mj_setConst renews what MuJoCo derives from both. Editing the compiled
+    model rather than its XML matters for HalfCheetah, whose compiler rescales every edit to a total of 14 kg.
+    """
+    for change in changes:
+        if change.field == "mass":
+            body = _id_of(model, "body", change)
+            old = model.body_mass[body]
+            if old == 0:
+                raise EnvError(f"body {change.name!r} has no mass of its own: name a body that has")
+            model.body_inertia[body] *= change.of(old) / old
+            model.body_mass[body] = change.of(old)
+        elif change.field == "gravity":
+            if change.name != "world":
+                raise EnvError(f"gravity belongs to the world: write world:gravity{change.op}{change.value:g}")
+            # acceleration is positive downwards here, so that "=9.81" is the Earth's
+            model.opt.gravity[2] = -change.of(-model.opt.gravity[2])
+        elif change.field == "gain":
+            actuators = [i for i in range(model.nu) if change.name in (model.actuator(i).name, model.joint(model.actuator_trnid[i, 0]).name)]
+            if not actuators:
+                joints = ", ".join(model.joint(j).name for j in model.actuator_trnid[:, 0])
+                raise EnvError(f"no actuator {change.name!r} for its gain: name its joint, one of {joints}")
+            for i in actuators:
+                model.actuator_gainprm[i, 0] = change.of(model.actuator_gainprm[i, 0])
+        else:
+            joint = _id_of(model, "joint", change)
+            dofs = np.flatnonzero(model.dof_jntid == joint)
+            field = getattr(model, JOINT_FIELDS[change.field])
+            field[dofs] = [change.of(old) for old in field[dofs]]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+# --- the environment --------------------------------------------------------------------------------
+
+
+class BatchEnv(VectorEnv):
+    """num_envs copies of a gymnasium task, stepped together; see the module's docstring.
+
+    An ended episode starts anew within the same step (AutoresetMode.SAME_STEP): the returned observation is
+    the new episode's first, and info["next_obs"] (num_envs, nobs) holds every transition's true successor.
+
+    Args:
+      env_id: one of ENV_IDS. num_envs: copies. perturbation: Changes that make this world "real".
+      model: a mujoco.MjModel to run instead of gymnasium's own, with the same joints and actuators.
+      nthread: threads of the simulator's pool, 0 for all cores.
+    Raises EnvError: unknown id or name, num_envs < 1, or an unstable simulation (in step).
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+
+    def __init__(self, env_id, num_envs, perturbation=(), model=None, nthread=0):
+        if num_envs < 1:
+            raise EnvError(f"num_envs is {num_envs}: it must be at least 1")
+        self.task = task_of(env_id)
+        self.env_id, self.num_envs = env_id, num_envs
+        self.spec = gymnasium.spec(env_id)
+        self.model = mujoco.MjModel.from_xml_path(str(model_path(env_id))) if model is None else model
+        if perturbation:
+            perturb(self.model, perturbation)
+        self.dt = self.model.opt.timestep * self.task.frame_skip
+        # v4 pays for the step that falls, v5 does not
+        self._pays_on_end = env_id.endswith("v4")
+
+        self.batch = Batch(self.model, num_envs, nthread)
+        self.qpos, self.qvel, self._ctrl = (self.batch.bind(field) for field in ("qpos", "qvel", "ctrl"))
+        self._init_qpos = self.model.qpos0.copy()
+        self._rng = [None] * num_envs
+        self.steps = np.zeros(num_envs, int)
+
+        nobs = self.model.nq + self.model.nv - self.task.skip_root_x
+        low, high = self.model.actuator_ctrlrange.astype(np.float32).T
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (nobs,), np.float64)
+        self.single_action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def observe(self):
+        """The current observations, (num_envs, nobs), as gymnasium's _get_obs."""
+        velocity = np.clip(self.qvel, -self.task.clip_velocity, self.task.clip_velocity)
+        return np.concatenate((self.qpos[:, self.task.skip_root_x :], velocity), axis=1)
+
+    def reset(self, *, seed=None, options=None):
+        """Start every environment anew; environment i draws from seed + i. Returns (obs, {})."""
+        if seed is not None or self._rng[0] is None:
+            seeds = [None] * self.num_envs if seed is None else [seed + i for i in range(self.num_envs)]
+            self._rng = [seeding.np_random(s)[0] for s in seeds]
+        self._restart(np.arange(self.num_envs))
+        self.obs = self.observe()
+        return self.obs.copy(), {}
+
+    def _restart(self, ids):
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        noise = self.task.reset_noise
+        for i in ids:
+            rng = self._rng[i]
+            self.qpos[i] = self._init_qpos + rng.uniform(-noise, noise, self.model.nq)
+            if self.task.normal_qvel:
+                self.qvel[i] = noise * rng.standard_normal(self.model.nv)
+            else:
+                self.qvel[i] = rng.uniform(-noise, noise, self.model.nv)
+        self.batch.forward(ids)
+        self.steps[ids] = 0
+
+    def step(self, actions, applied=None):
+        """Advance all environments by one action each.
+
+        Args:
+          actions: (num_envs, nu), what the policy chose; the reward is computed on it.
+          applied: (num_envs, nu), what drives the joints, if an action transformer changed it.
+
+        Returns:
+          obs (num_envs, nobs), reward (num_envs,), terminated, truncated (num_envs,) bool, info with "next_obs"
+          and, where episodes ended, gymnasium's "final_obs" and "_final_obs".
+        """
+        actions = np.asarray(actions)
+        if actions.shape != self.action_space.shape:
+            raise EnvError(f"actions have shape {actions.shape}: {self.env_id} takes {self.action_space.shape}")
+        x_before = self.qpos[:, 0].copy()
+        self._ctrl[:] = actions if applied is None else applied
+        self.batch.step(nstep=self.task.frame_skip)
+        if self.batch.warning.any():
+            self._explain_warning()
+        self.steps += 1
+
+        terminated = self.task.unhealthy(self.qpos, self.qvel)
+        truncated = self.steps >= TIME_LIMIT
+        reward = self._reward(actions, (self.qpos[:, 0] - x_before) / self.dt, terminated)
+        next_obs = self.observe()
+        info = {"next_obs": next_obs}
+        self.obs = next_obs
+        done = terminated | truncated
+        if done.any():
+            ids = np.flatnonzero(done)
+            info["final_obs"] = np.array([next_obs[i] if d else None for i, d in enumerate(done)] + [None], object)[:-1]
+            info["_final_obs"] = done
+            self._restart(ids)
+            self.obs = self.observe()
+        return self.obs.copy(), reward, terminated, truncated, info
+
+    def _reward(self, actions, x_velocity, terminated):
+        task = self.task
+        reward = np.zeros(self.num_envs)
+        if task.forward_weight:
+            reward += task.forward_weight * x_velocity
+        if task.healthy_reward:
+            reward += task.healthy_reward if self._pays_on_end else task.healthy_reward * ~terminated
+        if task.ctrl_weight:
+            reward -= task.ctrl_weight * np.square(actions).sum(axis=1)
+        return reward
+
+    def _explain_warning(self):
+        # columns: last offending index, how often; a NaN control counts as unstable too
+        kinds = mujoco.mjtWarning
+        fatal = [int(w) for w in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC, kinds.mjWARN_BADCTRL)]
+        unstable = np.flatnonzero(self.batch.warning[:, fatal, 1].any(axis=1))
+        if unstable.size:
+            raise EnvError(
+                f"{self.env_id}: the simulation became unstable (NaN or huge values) in environment {unstable[0]} at step "
+                f"{self.steps[unstable[0]]}: if --real changed the model, choose a smaller change"
+            )
+        self.batch.warning[:] = 0

@@ -1,0 +1,228 @@
+"""The four networks of the method: policies and values for TRPO, forward and inverse models for grounding.
+
+    policy = GaussianPolicy(nobs=11, nact=3)
+    action = policy.act(obs)                           # (N, 3), sampled; .mean(obs) is deterministic
+    policy.save("policy.pt"); policy = GaussianPolicy.load("policy.pt")
+    f = ForwardModel(11, 3); f.fit(s, a, s_next); s_hat = f(s, a)      # f_psi, paper section III
+
+All are float32 MLPs that normalise their own inputs, and need torch alone.
+"""
+
+import math
+
+import torch
+from torch import nn
+
+DEEP, SHALLOW = (64, 64), (4,)  # hidden layers of the paper's two target policies (section IV-B)
+LOG_2PI_E = math.log(2 * math.pi * math.e)
+
+
+def mlp(sizes, last_gain=1.0, activation=nn.Tanh):
+    """Fully connected layers of the given sizes; orthogonal weights, the last layer's scaled by last_gain."""
+    layers = []
+    for i, (n_in, n_out) in enumerate(zip(sizes, sizes[1:])):
+        last = i == len(sizes) - 2
+        layer = nn.Linear(n_in, n_out)
+        nn.init.orthogonal_(layer.weight, last_gain if last else math.sqrt(2))
+        nn.init.zeros_(layer.bias)
+        layers += [layer] if last else [layer, activation()]
+    return nn.Sequential(*layers)
+
+
+class Normalizer(nn.Module):
+    """(x - mean) / std with statistics kept as buffers: saved with the network, never trained by gradients."""
+
+    def __init__(self, size, clip=10.0):
+        super().__init__()
+        self.clip = clip
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("var", torch.ones(size))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    def forward(self, x):
+        return torch.clamp((x - self.mean) / self.std, -self.clip, self.clip)
+
+    @property
+    def std(self):
+        return torch.sqrt(self.var + 1e-8)
+
+    def inverse(self, y):
+        return y * self.std + self.mean
+
+    @torch.no_grad()
+    def update(self, x):
+        """Merge the rows of x (N, size) into the running mean and variance."""
+        n = len(x)
+        total = self.count + n
+        weight = float(n / total)
+        delta = x.mean(0) - self.mean
+        self.var.mul_(1 - weight).add_(weight * x.var(0, unbiased=False) + weight * (1 - weight) * delta**2)
+        if self.count == 0:
+            self.var.copy_(x.var(0, unbiased=False))
+        self.mean.add_(weight * delta)
+        self.count.copy_(total)
+
+
+class GaussianPolicy(nn.Module):
+    """pi(a|s) = N(mean_theta(s), diag(exp(log_std))^2): an MLP mean and a state-independent log_std.
+
+    Args: nobs, nact: widths. hidden: hidden layer widths. log_std: initial value for every action dimension.
+    """
+
+    def __init__(self, nobs, nact, hidden=DEEP, log_std=0.0):
+        super().__init__()
+        self.sizes = (nobs, *hidden, nact)
+        self.normalizer = Normalizer(nobs)
+        self.net = mlp(self.sizes, last_gain=0.01)  # starts near mean 0 everywhere
+        self.log_std = nn.Parameter(torch.full((nact,), float(log_std)))
+
+    def mean(self, obs):
+        """The deterministic action, (N, nact), for obs (N, nobs)."""
+        return self.net(self.normalizer(obs))
+
+    def forward(self, obs):
+        """Mean (N, nact) and log_std (nact,)."""
+        return self.mean(obs), self.log_std
+
+    @torch.no_grad()
+    def act(self, obs, generator=None):
+        """A sample for each row of obs: (N, nact)."""
+        mean = self.mean(obs)
+        return mean + self.log_std.exp() * torch.randn(mean.shape, generator=generator)
+
+    def save(self, path):
+        torch.save({"sizes": list(self.sizes), "state": self.state_dict()}, path)
+
+    @classmethod
+    def load(cls, path):
+        """The policy that save() wrote. Raises ValueError for any other file; never unpickles code."""
+        return cls.from_state(load_checkpoint(path))
+
+    @classmethod
+    def from_state(cls, saved):
+        try:
+            sizes = saved["sizes"]
+            policy = cls(sizes[0], sizes[-1], tuple(sizes[1:-1]))
+            policy.load_state_dict(saved["state"])
+        except (KeyError, TypeError, IndexError, RuntimeError) as error:
+            raise ValueError(f"no policy in this checkpoint ({str(error).splitlines()[0]})") from None
+        return policy
+
+
+def load_checkpoint(path):
+    """torch.load with weights_only=True. Raises ValueError, in one line, for whatever it cannot read."""
+    try:
+        return torch.load(path, weights_only=True)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such checkpoint") from None
+    except Exception as error:  # torch raises a dozen types for damaged files
+        raise ValueError(f"{path}: not a checkpoint of this program, or a damaged one ({type(error).__name__})") from None
+
+
+def gaussian_log_prob(mean, log_std, action):
+    """log N(action; mean, exp(log_std)^2), summed over the action's dimensions: (N,)."""
+    z = (action - mean) * torch.exp(-log_std)
+    return -0.5 * (z**2).sum(-1) - log_std.sum() - 0.5 * math.log(2 * math.pi) * action.shape[-1]
+
+
+def gaussian_kl(mean0, log_std0, mean1, log_std1):
+    """KL(N0 || N1) of diagonal Gaussians, averaged over the rows: a scalar."""
+    var0, var1 = torch.exp(2 * log_std0), torch.exp(2 * log_std1)
+    per_dim = log_std1 - log_std0 + (var0 + (mean0 - mean1) ** 2) / (2 * var1) - 0.5
+    return per_dim.sum(-1).mean()
+
+
+def gaussian_entropy(log_std):
+    """Entropy in nats of a diagonal Gaussian."""
+    return log_std.sum() + 0.5 * LOG_2PI_E * len(log_std)
+
+
+class Value(nn.Module):
+    """V(s), predicted in units of the returns seen so far so that the loss keeps one scale."""
+
+    def __init__(self, nobs, hidden=DEEP):
+        super().__init__()
+        self.normalizer = Normalizer(nobs)
+        self.returns = Normalizer(1)
+        self.net = mlp((nobs, *hidden, 1))
+
+    def forward(self, obs):
+        """Values (N,) of obs (N, nobs), in units of reward."""
+        return self.returns.inverse(self.scaled(obs))[:, 0]
+
+    def scaled(self, obs):
+        return self.net(self.normalizer(obs))
+
+
+# --- supervised models of the dynamics --------------------------------------------------------------
+
+
+class Regressor(nn.Module):
+    """y = net(x) with inputs and outputs normalised by the training data's statistics."""
+
+    def __init__(self, n_in, n_out, hidden=(128, 128)):
+        super().__init__()
+        self.inputs, self.outputs = Normalizer(n_in), Normalizer(n_out)
+        self.net = mlp((n_in, *hidden, n_out))
+
+    def forward(self, x):
+        return self.outputs.inverse(self.net(self.inputs(x)))
+
+    def fit(self, x, y, generator, max_epochs=200, patience=10, batch_size=256, lr=1e-3):
+        """Least squares with Adam; stops when the held-out fifth has not improved for `patience` epochs.
+
+        Args: x (N, n_in), y (N, n_out) float32 tensors; generator: the split and the batches are drawn from it.
+        Returns: the root mean squared error on the held-out rows, in units of y. Keeps the best epoch's weights.
+        """
+        order = torch.randperm(len(x), generator=generator)
+        held, train = order[: max(1, len(x) // 5)], order[max(1, len(x) // 5) :]
+        for normalizer, data in ((self.inputs, x), (self.outputs, y)):
+            normalizer.count.zero_()
+            normalizer.update(data[train])
+        x, target = self.inputs(x), (y - self.outputs.mean) / self.outputs.std
+        optimizer = torch.optim.Adam(self.net.parameters(), lr=lr)
+        best, best_state, stale = math.inf, None, 0
+        for _ in range(max_epochs):
+            for rows in train[torch.randperm(len(train), generator=generator)].split(batch_size):
+                loss = ((self.net(x[rows]) - target[rows]) ** 2).mean()
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+            with torch.no_grad():
+                error = float(((self.net(x[held]) - target[held]) ** 2).mean())
+            stale += 1
+            if error < best:
+                best, best_state, stale = error, {k: v.clone() for k, v in self.net.state_dict().items()}, 0
+            if stale >= patience:
+                break
+        self.net.load_state_dict(best_state)
+        with torch.no_grad():
+            return float(((self.outputs.std * (self.net(x[held]) - target[held])) ** 2).sum(-1).mean().sqrt())
+
+
+class ForwardModel(Regressor):
+    """f(s, a) -> s': predicts the change of state, an easier target than the state itself."""
+
+    def __init__(self, nobs, nact, hidden=(128, 128)):
+        super().__init__(nobs + nact, nobs, hidden)
+
+    def forward(self, s, a):
+        return s + super().forward(torch.cat((s, a), -1))
+
+    def fit(self, s, a, s_next, generator, **settings):
+        """Fit to transitions (N, nobs), (N, nact), (N, nobs). Returns the held-out RMS of ||s' - f(s, a)||."""
+        return super().fit(torch.cat((s, a), -1), s_next - s, generator, **settings)
+
+
+class InverseModel(Regressor):
+    """f^-1(s, s') -> a: the action that most likely led from s to s'."""
+
+    def __init__(self, nobs, nact, hidden=(128, 128)):
+        super().__init__(2 * nobs, nact, hidden)
+
+    def forward(self, s, s_next):
+        return super().forward(torch.cat((s, s_next - s), -1))
+
+    def fit(self, s, s_next, a, generator, **settings):
+        """Fit to transitions (N, nobs), (N, nobs), (N, nact). Returns the held-out RMS of the action's error."""
+        return super().fit(torch.cat((s, s_next - s), -1), a, generator, **settings)

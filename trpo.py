@@ -1,0 +1,312 @@
+"""Trust region policy optimisation (Schulman et al. 2015) with GAE(lambda), for any batched environment.
+
+    learner = TRPO(policy, value, TRPOConfig(), seed=0)
+    learner.learn(env, steps=1_000_000, on_update=print)
+
+The environment is a gymnasium VectorEnv in SAME_STEP autoreset mode that also hands out info["next_obs"],
+the true successor of every transition. Each update solves
+
+    max_theta  E[pi_theta/pi_old * A] + entropy * H(pi_theta)   s.t.  E[KL(pi_old || pi_theta)] <= max_kl
+
+to first order: conjugate gradient on the Fisher matrix gives the direction, the constraint the length, and a
+line search the largest step that really keeps both promises.
+"""
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from models import gaussian_entropy, gaussian_kl, gaussian_log_prob
+
+
+@dataclass(frozen=True)
+class TRPOConfig:
+    """One learner's settings; the target policy and the action transformer are two instances."""
+
+    batch_size: int = 4096  # transitions per update, over all environments
+    gamma: float = 0.99  # discount
+    lam: float = 0.95  # lambda of GAE
+    max_kl: float = 0.01  # trust region, nats
+    entropy: float = 0.0  # weight of the entropy inside the surrogate
+    cg_steps: int = 15  # conjugate gradient iterations
+    cg_damping: float = 0.1  # added to the Fisher matrix's diagonal
+    fisher_every: int = 5  # the Fisher product uses every k-th transition
+    backtracks: int = 10  # halvings tried by the line search
+    value_epochs: int = 5  # passes of Adam over the batch for the value function
+    value_lr: float = 1e-3
+    value_batch: int = 512  # its minibatch
+    normalize_obs: bool = False  # running mean and std of the observations, until frozen
+
+
+PRESETS = {
+    "InvertedPendulum": TRPOConfig(batch_size=2048),
+    "Hopper": TRPOConfig(),
+    "HalfCheetah": TRPOConfig(),
+}
+
+
+# --- the pieces ---------------------------------------------------------------------------------------
+
+
+def gae(reward, value, next_value, terminated, done, gamma, lam):
+    """Generalised advantage estimates (Schulman et al. 2016, eq. 16); all arrays (T, N), returns (T, N).
+
+    next_value is V of the true successor, so an episode cut by its time limit (done, not terminated) is
+    bootstrapped and one that terminated is not.
+    """
+    delta = reward + gamma * next_value * ~terminated - value
+    advantage = np.zeros_like(delta)
+    running = np.zeros(delta.shape[1])
+    for t in range(len(delta) - 1, -1, -1):
+        running = delta[t] + gamma * lam * ~done[t] * running
+        advantage[t] = running
+    return advantage
+
+
+def conjugate_gradient(product, b, steps, tolerance=1e-10):
+    """Solve A x = b for a symmetric positive definite A given as product(v) = A v. b, x: (n,)."""
+    x = torch.zeros_like(b)
+    r, p = b.clone(), b.clone()
+    rr = r @ r
+    for _ in range(steps):
+        if rr <= tolerance * (b @ b):
+            break
+        Ap = product(p)
+        pAp = p @ Ap
+        if not pAp > 0:  # rounding has eaten the curvature (or NaN): what we have is as good as it gets
+            break
+        alpha = rr / pAp
+        x = x + alpha * p
+        r = r - alpha * Ap
+        rr_new = r @ r
+        p = r + (rr_new / rr) * p
+        rr = rr_new
+    return x
+
+
+def fisher_product(policy, obs, damping):
+    """v -> (F + damping I) v, F the Fisher matrix of the policy at its present parameters, over obs (N, nobs).
+
+    F is the Hessian of KL(pi || pi_theta) at theta = pi: the KL and its gradient are 0 there, its Hessian is
+    not. One differentiation of gradient . v gives the product without ever forming F.
+    """
+    parameters = list(policy.parameters())
+    mean, log_std = policy(obs)
+    kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)
+    gradient = torch.cat([g.reshape(-1) for g in torch.autograd.grad(kl, parameters, create_graph=True)])
+
+    def product(v):
+        hessian_v = torch.autograd.grad(gradient @ v, parameters, retain_graph=True)
+        return torch.cat([g.reshape(-1) for g in hessian_v]) + damping * v
+
+    return product
+
+
+def policy_update(policy, obs, action, advantage, config):
+    """One TRPO step on the policy, in place. obs (N, nobs), action (N, nact), advantage (N,), torch tensors.
+
+    Returns a dict: kl, surrogate_gain, step_size (the fraction of the full step taken, 0 if none), line_search
+    ("accepted", "no gradient", "no curvature", "exhausted"), entropy. Parameters change only if the new ones
+    are finite, keep KL <= max_kl and better the surrogate; otherwise they are restored exactly.
+    """
+    advantage = advantage.double()
+    spread = advantage.std() if len(advantage) > 1 else torch.zeros(())
+    # an advantage that is the same everywhere says nothing; dividing by its rounding error would
+    informative = torch.isfinite(spread) and spread > 1e-9 * advantage.abs().max()
+    advantage = ((advantage - advantage.mean()) / spread if informative else torch.zeros_like(advantage)).to(obs.dtype)
+
+    with torch.no_grad():
+        old_mean, old_log_std = policy(obs)
+        old_log_std = old_log_std.clone()
+        old_log_prob = gaussian_log_prob(old_mean, old_log_std, action)
+
+    def surrogate():
+        mean, log_std = policy(obs)
+        ratio = torch.exp(gaussian_log_prob(mean, log_std, action) - old_log_prob)
+        kl = gaussian_kl(old_mean, old_log_std, mean, log_std)
+        return (ratio * advantage).mean() + config.entropy * gaussian_entropy(log_std), kl
+
+    stats = {"kl": 0.0, "surrogate_gain": 0.0, "step_size": 0.0, "line_search": "accepted"}
+    old_surrogate, _ = surrogate()
+    gradient = parameters_to_vector(torch.autograd.grad(old_surrogate, list(policy.parameters())))
+    old_surrogate = old_surrogate.detach()
+    old = parameters_to_vector(policy.parameters()).detach().clone()
+    if not torch.isfinite(gradient).all() or not gradient.any():
+        return {**stats, "line_search": "no gradient", "entropy": float(gaussian_entropy(old_log_std))}
+
+    product = fisher_product(policy, obs[:: config.fisher_every], config.cg_damping)
+    direction = conjugate_gradient(product, gradient, config.cg_steps)
+    curvature = direction @ product(direction)
+    full_step = torch.sqrt(2 * config.max_kl / curvature) * direction
+    stats["line_search"] = "exhausted" if torch.isfinite(full_step).all() else "no curvature"
+    if stats["line_search"] == "exhausted":
+        with torch.no_grad():
+            for k in range(config.backtracks):
+                vector_to_parameters(old + 0.5**k * full_step, policy.parameters())
+                new_surrogate, kl = surrogate()
+                if torch.isfinite(new_surrogate) and kl <= config.max_kl and new_surrogate > old_surrogate:
+                    gain = float(new_surrogate - old_surrogate)
+                    stats.update(kl=float(kl), surrogate_gain=gain, step_size=0.5**k, line_search="accepted")
+                    break
+            else:
+                vector_to_parameters(old, policy.parameters())
+    stats["entropy"] = float(gaussian_entropy(policy.log_std.detach()))
+    return stats
+
+
+def value_update(value, optimizer, obs, returns, config, generator):
+    """Fit V to returns (N,) by minibatch Adam on the squared error, in the value's own scale."""
+    value.returns.update(returns[:, None])
+    target = (returns[:, None] - value.returns.mean) / value.returns.std
+    for _ in range(config.value_epochs):
+        for rows in torch.randperm(len(obs), generator=generator).split(config.value_batch):
+            loss = ((value.scaled(obs[rows]) - target[rows]) ** 2).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+
+
+def explained_variance(prediction, target):
+    """1 - Var[target - prediction] / Var[target]; 0 where the target does not vary."""
+    var = np.var(target)
+    return float(1 - np.var(target - prediction) / var) if var > 0 else 0.0
+
+
+# --- the learner --------------------------------------------------------------------------------------
+
+
+@contextmanager
+def torch_threads(n):
+    """Within a rollout torch takes one thread: its own would fight the simulator's pool for the cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(n)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class TRPO:
+    """A policy, its value function, and how they learn.
+
+    Args: policy: GaussianPolicy; value: Value; config: TRPOConfig; seed: of the sampling and the minibatches.
+    """
+
+    def __init__(self, policy, value, config, seed=0):
+        self.policy, self.value, self.config = policy, value, config
+        self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def state(self):
+        """What a checkpoint needs to go on learning."""
+        return {"policy": self.policy.state_dict(), "value": self.value.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load(self, state):
+        """Take over what state() returned."""
+        self.policy.load_state_dict(state["policy"])
+        self.value.load_state_dict(state["value"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+    def learn(self, env, steps, seed=0, freeze_normalizer=True, update_policy=True, on_update=None):
+        """Train on env (reset with seed) for at least `steps` transitions, in whole batches.
+
+        freeze_normalizer: keep the observation statistics as they are; update_policy=False trains the value
+        function alone. on_update(stats) is called with a dict after every update.
+        """
+        obs, _ = env.reset(seed=seed)
+        horizon = max(1, self.config.batch_size // env.num_envs)
+        adapt = self.config.normalize_obs and not freeze_normalizer
+        returns_of = EpisodeReturns(env.num_envs)
+        done_steps = 0
+        while done_steps < steps:
+            with torch_threads(1):
+                batch, obs = self.collect(env, obs, horizon)
+            done_steps += horizon * env.num_envs
+            stats = self.update(batch, update_policy)
+            if adapt:
+                for network in (self.policy, self.value):
+                    network.normalizer.update(torch.from_numpy(batch["obs"].reshape(-1, batch["obs"].shape[-1])))
+            if on_update:
+                on_update({"steps": done_steps, "return": returns_of.mean(batch), **stats})
+
+    def collect(self, env, obs, horizon):
+        """Act for `horizon` steps. Returns arrays (T, N, ...) by name, and the observation to go on from."""
+        low, high = env.single_action_space.low, env.single_action_space.high
+        rows = []
+        for _ in range(horizon):
+            obs32 = np.asarray(obs, np.float32)
+            action = self.policy.act(torch.from_numpy(obs32), self.generator).numpy()
+            obs, reward, terminated, truncated, info = env.step(np.clip(action, low, high))
+            rows.append((obs32, action, reward, terminated, terminated | truncated, info["next_obs"].astype(np.float32)))
+        names = ("obs", "action", "reward", "terminated", "done", "next_obs")
+        return {name: np.stack(column) for name, column in zip(names, zip(*rows))}, obs
+
+    @torch.no_grad()
+    def advantages(self, batch):
+        """GAE advantages and the values they are measured from, both (T, N)."""
+        T, N = batch["reward"].shape
+        value = self.value(torch.from_numpy(batch["obs"]).flatten(0, 1)).numpy().reshape(T, N).astype(float)
+        # the successor's value is the next row's, save where an episode or the batch ends
+        next_value = np.concatenate((value[1:], np.zeros((1, N))))
+        edge = batch["done"].copy()
+        edge[-1] = True
+        next_value[edge] = self.value(torch.from_numpy(batch["next_obs"][edge])).numpy()
+        config = self.config
+        return gae(batch["reward"], value, next_value, batch["terminated"], batch["done"], config.gamma, config.lam), value
+
+    def update(self, batch, update_policy=True):
+        """One update of policy and value from collect()'s arrays; returns the statistics to log."""
+        advantage, value = self.advantages(batch)
+        returns = advantage + value
+        obs, action = (torch.from_numpy(batch[k]).flatten(0, 1) for k in ("obs", "action"))
+        stats = {}
+        if update_policy:
+            stats = policy_update(self.policy, obs, action, torch.from_numpy(advantage.reshape(-1)), self.config)
+        stats["explained_variance"] = explained_variance(value, returns)
+        stats["std"] = float(self.policy.log_std.detach().exp().mean())
+        stats["reward"] = float(batch["reward"].mean())
+        targets = torch.from_numpy(returns.reshape(-1)).float()
+        value_update(self.value, self.optimizer, obs, targets, self.config, self.generator)
+        return stats
+
+
+class EpisodeReturns:
+    """Mean undiscounted return of the episodes that ended in each batch."""
+
+    def __init__(self, num_envs):
+        self.running = np.zeros(num_envs)
+        self.last = float("nan")
+
+    def mean(self, batch):
+        ended = []
+        for reward, done in zip(batch["reward"], batch["done"]):
+            self.running += reward
+            ended += list(self.running[done])
+            self.running[done] = 0
+        self.last = float(np.mean(ended)) if ended else self.last
+        return self.last
+
+
+def evaluate(policy, env, episodes, seed, deterministic=True):
+    """Undiscounted returns (episodes,) of a policy, one fresh episode per environment of env at a time.
+
+    Only each environment's first episode after a reset counts, so that short episodes are not favoured.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    low, high = env.single_action_space.low, env.single_action_space.high
+    returns = []
+    with torch_threads(1), torch.no_grad():
+        while len(returns) < episodes:
+            obs, _ = env.reset(seed=seed + len(returns))
+            total, alive = np.zeros(env.num_envs), np.ones(env.num_envs, bool)
+            while alive.any():
+                obs = torch.from_numpy(np.asarray(obs, np.float32))
+                action = policy.mean(obs) if deterministic else policy.act(obs, generator)
+                obs, reward, terminated, truncated, _ = env.step(np.clip(action.numpy(), low, high))
+                total += reward * alive
+                alive &= ~(terminated | truncated)
+            returns += list(total)
+    return np.array(returns[:episodes])
