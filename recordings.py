@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from readers import WIDTHS, RecordingError, columns_of, read
+from units import suspect
 
 LARGEST = {"time": 1e300, "qpos": 1e6, "qvel": 1e6, "ctrl": 1e9, "sensor": 1e12}  # beyond these no unit explains a value
 
@@ -115,3 +116,180 @@ def _quaternions(path, qpos, model, first_row):
             what = "is partly nan" if partly[row] else f"has length {norm[row]:.4g} instead of 1"
             raise RecordingError(f"{path}: row {row + first_row}, columns 'qpos:{model.joint(j).name or j}:{end - 4 - model.jnt_qposadr[j]}' "
                                  f"and the next three: the quaternion {what}; order is w x y z")
+
+
+# --- plausibility ---------------------------------------------------------------------------------------------------
+
+ENOUGH = "10 s of varied motion sampled at 50 Hz or more is a good start"
+
+
+def check(recordings, model):
+    """What looks wrong, one line each: for the user to read before believing a diagnosis.
+
+    Raises RecordingError where the evidence is beyond doubt (a time in ms, a joint in degrees, swapped columns, a gap,
+    nothing that moves) since a diagnosis would then describe the mistake and not the machine.
+    """
+    found = {}  # message -> names of the recordings it holds for
+
+    def warn(recording, message):
+        found.setdefault(message, []).append(recording.name)
+
+    for recording in recordings:
+        _check_time(recording, model, warn)
+        _check_values(recording, model, warn)
+        _check_rates(recording, model, warn)
+    moving = [recording for recording in recordings if _moves(recording)]
+    rows, seconds = sum(len(r.time) for r in moving), sum(r.time[-1] - r.time[0] for r in moving)
+    if not moving:
+        raise RecordingError(f"{recordings[0].name}{_more(recordings)}: not enough data: nothing moves beyond the sensors' noise; "
+                             f"move every joint of interest ({ENOUGH})")
+    if rows < 20 or seconds < 0.6:
+        raise RecordingError(f"{recordings[0].name}{_more(recordings)}: not enough data: {rows} rows over {seconds:.2g} s; at least "
+                             f"20 rows over 0.6 s are needed, and {ENOUGH}")
+    for recording in recordings:
+        if not any(recording is other for other in moving):
+            warn(recording, "nothing moves beyond the sensors' noise; it says little")
+    for recording in moving[:5]:
+        doubt = suspect(recording, model)
+        if doubt:
+            raise RecordingError(f"{recording.name}: {doubt}")
+    return [f"{names[0]}{_more(names)}: {message}" for message, names in found.items()]
+
+
+def _more(names):
+    return f" and {len(names) - 1} more" if len(names) > 1 else ""
+
+
+def _moves(recording):
+    """Whether any position leaves the band of its own noise (8 sigma, from second differences) for good."""
+    for values in recording.qpos.T:
+        values = values[~np.isnan(values)]
+        if len(values) < 5:
+            continue
+        noise = np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6))
+        smooth = np.convolve(values, np.ones(5) / 5, "valid")
+        if np.ptp(smooth) > 5 * noise + 1e-9 * (1 + np.abs(values).max()):
+            return True
+    return False
+
+
+def _check_time(recording, model, warn):
+    """Unit of time and gaps."""
+    steps = np.diff(recording.time)
+    usual = np.median(steps)
+    where = f"{recording.name}: column 'time'"
+    if usual >= 0.3:
+        unit, factor = ("milliseconds", 1e3) if usual < 300 else ("microseconds", 1e6) if usual < 3e5 else ("nanoseconds", 1e9)
+        raise RecordingError(f"{where}: rows stand {usual:g} s apart, too far to see any dynamics; if these are {unit}, "
+                             f"divide by {factor:g}")
+    if usual < 1e-6 or usual < model.opt.timestep / 500:
+        raise RecordingError(f"{where}: rows stand {usual:.3g} s apart against a time step of {model.opt.timestep:g} s; "
+                             "write seconds")
+    row = int(np.argmax(steps))
+    if steps[row] > max(20 * usual, 0.1):
+        raise RecordingError(f"{where}: gap of {steps[row]:.3g} s after data row {row + 1}, at {recording.time[row]:.6g} s (rows are {usual:.3g} s apart); "
+                             "split the file there, or write the missing rows with nan positions and their control")
+    if steps[row] > 5 * usual:
+        warn(recording, f"gap of {steps[row]:.3g} s after {recording.time[row]:.6g} s, rows are {usual:.3g} s apart")
+
+
+def _check_values(recording, model, warn):
+    """Channel by channel: constant, clipped, mostly missing, wrapped angles, far outside the model's ranges."""
+    rows = len(recording.time)
+    for column, (kind, k) in columns_of(model).items():
+        if kind not in ("qpos", "ctrl"):
+            continue
+        values = getattr(recording, kind)[:, k]
+        where = f"{recording.name}: column {column!r}"
+        missing = np.isnan(values)
+        if missing.any():
+            share = 100 * missing.mean()
+            warn(recording, f"{column} is not measured" if missing.all() else
+                 f"{column} has nan in {share:.0f} % of its rows" if share >= 1 else f"{column} has nan in {missing.sum()} rows")
+            values = values[~missing]
+        if len(values) < 2:
+            continue
+        low, high = values.min(), values.max()
+        if low == high:
+            warn(recording, f"{column} is constant at {low:g}; nothing can be said about what only it would show")
+            continue
+        if kind == "qpos":
+            joint = int(np.searchsorted(model.jnt_qposadr, k, side="right")) - 1
+            single = model.jnt_type[joint] not in WIDTHS
+            hinge = single and model.jnt_type[joint] == 3
+            limited, span = single and model.jnt_limited[joint], model.jnt_range[joint]
+            jumps = np.abs(np.diff(values))
+            row = int(np.argmax(jumps))
+            speed = np.percentile(jumps / np.diff(recording.time[~missing]), 90)
+            if speed > (3000 if hinge else 340):
+                raise RecordingError(f"{where}: moves at {speed:.3g} {'rad/s' if hinge else 'm/s'} for long; convert it to "
+                                     f"{'rad' if hinge else 'm'}, and time to s")
+            if hinge and abs(jumps[row] - 2 * np.pi) < 0.5 and jumps[row] > 20 * np.median(jumps) + 1e-6:
+                raise RecordingError(f"{where}: jumps by {jumps[row]:.3g} rad after data row {np.flatnonzero(~missing)[row] + 1}, a "
+                                     "wrapped angle; unwrap it (numpy.unwrap)")
+        else:
+            limited, span = model.actuator_ctrllimited[k], model.actuator_ctrlrange[k]
+        largest = max(abs(low), abs(high))
+        if limited and largest > 10 * np.abs(span).max() > 0:
+            unit = "degrees" if kind == "qpos" and hinge else "another unit than the model's"
+            raise RecordingError(f"{where}: reaches {largest:g} where the model's range is {span[0]:g} to {span[1]:g}; "
+                                 f"if it is in {unit}, convert it")
+        if kind == "ctrl" and limited and (low < span[0] - 1e-3 * np.ptp(span) or high > span[1] + 1e-3 * np.ptp(span)):
+            warn(recording, f"{column} leaves the model's ctrlrange {span[0]:g} to {span[1]:g}; MuJoCo clips it there")
+        for edge in (low, high):
+            clipped = values == edge
+            share = np.count_nonzero(clipped[1:] & clipped[:-1]) / rows
+            at_range = kind == "ctrl" and limited and abs(edge - span[int(edge == high)]) < 1e-6 * (1 + abs(edge))
+            if share > 0.03 and (at_range or largest > 0 and abs(edge) == largest or kind == "ctrl" and low == -high):
+                warn(recording, f"{column} stays at its extreme {edge:g} in {100 * share:.0f} % of the rows: saturated"
+                     + (" (at ctrlrange)" if at_range else ", clipped, or at a stop" if kind == "qpos" else ""))
+
+
+def _check_rates(recording, model, warn):
+    """Measured velocities against the change of the positions beside them: units, signs and swapped columns."""
+    time = recording.time
+    stride = max(1, int(round(0.03 / np.median(np.diff(time)))))
+    if len(time) < 4 * stride + 8:
+        return
+    gone, travelled, names = [], [], []
+    for j in range(model.njnt):
+        if model.jnt_type[j] == 1:  # a ball joint's angular velocity is no derivative of its quaternion
+            continue
+        for k in range(3 if model.jnt_type[j] == 0 else 1):
+            q, v = recording.qpos[:, model.jnt_qposadr[j] + k], recording.qvel[:, model.jnt_dofadr[j] + k]
+            step = 0.5 * (v[1:] + v[:-1]) * np.diff(time)
+            integral, holes = (np.concatenate([[0], np.cumsum(x)]) for x in (np.nan_to_num(step), np.isnan(step)))
+            whole = holes[2 * stride:] == holes[:-2 * stride]
+            gone.append(q[2 * stride:] - q[:-2 * stride])
+            travelled.append(np.where(whole, integral[2 * stride:] - integral[:-2 * stride], np.nan))
+            names.append((model.joint(j).name or str(j)) + (f":{k}" if model.jnt_type[j] == 0 else ""))
+
+    def alike(a, b):
+        both = ~np.isnan(a) & ~np.isnan(b)
+        if both.sum() < 20:
+            return None
+        a, b = a[both], b[both]
+        size = np.sqrt((a @ a) * (b @ b))
+        return (a @ b) / size if size > 1e-12 * both.sum() else None
+
+    for i, name in enumerate(names):
+        same = alike(gone[i], travelled[i])
+        if same is None:
+            continue
+        where = f"{recording.name}: column 'qvel:{name}'"
+        if same < 0.5:
+            for other, title in enumerate(names):
+                if other != i and (alike(gone[i], travelled[other]) or 0) > max(0.95, same + 0.4):
+                    raise RecordingError(f"{where}: does not follow 'qpos:{name}', but 'qvel:{title}' does; the columns are swapped")
+        if same < -0.9:
+            raise RecordingError(f"{where}: has the opposite sign of the change of 'qpos:{name}'; turn one of them round")
+        if same > 0.9:
+            both = ~np.isnan(gone[i]) & ~np.isnan(travelled[i])
+            ratio = np.sqrt((travelled[i][both] @ travelled[i][both]) / (gone[i][both] @ gone[i][both]))
+            if not 0.4 < ratio < 2.5:
+                why = next((text for factor, text in ((57.3, "qvel is in degrees"), (1 / 57.3, "qpos is in degrees"),
+                            (1000, "qvel is in mm/s, or time in ms"), (1e-3, "qpos is in mm")) if 0.7 < ratio / factor < 1.4),
+                           "one of them is in another unit")
+                raise RecordingError(f"{where}: is {ratio:.3g} times the change of 'qpos:{name}' per second; it seems {why}: use SI units")
+        elif same < 0.5:
+            warn(recording, f"qvel:{name} hardly follows the change of qpos:{name} (correlation {same:.2f})")
