@@ -1,0 +1,101 @@
+"""What a corrected simulator predicts: the reported error before, after and at the floor, its curve, and traces.
+
+    before = prediction_error(world, {}, recordings, noise)        # nominal
+    after = prediction_error(world, settings, recordings, noise)
+
+The error is the contract's (windows.error): consecutive windows, start as recorded, in units of the noise.
+"""
+
+import numpy as np
+
+import windows as cut
+
+
+def predict(world, settings, windows, starts=None):
+    """qpos (W, T, nq) and qvel (W, T, nv) of every window from its recorded start, or from the given ones."""
+    qpos, qvel = cut.recorded_starts(world.model, windows) if starts is None else starts
+    return world.simulate([settings] * len(windows), qpos, qvel, windows)
+
+
+def consecutive(recordings, horizon):
+    return [w for r in recordings for w in cut.consecutive(r, horizon)]
+
+
+def prediction_error(world, settings, recordings, noise, horizon=cut.HORIZON):
+    """(error over all channels in noises, {channel: error in SI})."""
+    windows = consecutive(recordings, horizon)
+    return cut.error(world.model, windows, predict(world, settings, windows)[0], noise)
+
+
+def floor_error(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, seed=0):
+    """The error that a perfect simulator would have: noise in the start state, carried on, and in what is compared."""
+    rng, model = np.random.default_rng(seed), world.model
+    windows = consecutive(recordings, horizon)
+    qpos, qvel = cut.recorded_starts(model, windows)
+    truth = predict(world, settings, windows, (qpos, qvel))[0]
+    finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
+    noisy_qvel = qvel.copy()
+    for i, w in enumerate(windows):
+        time = w.recording.time
+        a, b = max(w.first - 1, 0), min(w.first + 1, len(time) - 1)
+        measured = np.isfinite(w.recording.qvel[w.first])
+        scale = np.where(measured & np.isfinite(velocity_noise), velocity_noise, np.sqrt(2) * finite / (time[b] - time[a]))
+        noisy_qvel[i] += scale * rng.normal(size=model.nv)
+    again = predict(world, settings, windows, (cut.integrate(model, qpos, finite * rng.normal(size=qvel.shape)), noisy_qvel))[0]
+    noisy = cut.integrate(model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,)))
+    gap = cut.difference(model, again, noisy)[:, 1:]
+    known = np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows)))[:, 1:] & np.isfinite(gap)
+    square = np.where(known, gap**2, 0.0)
+    per_channel = {name: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
+                   for name, dofs in cut.channels(model).items() if known[..., dofs].any()}
+    noise = reporting_noise(position_noise)
+    return float(np.sqrt((square / noise**2).sum() / max(known.sum(), 1))), per_channel
+
+
+def reporting_noise(position_noise):
+    """Noise to divide by, (nv,): finite and positive everywhere."""
+    return np.where(np.isfinite(position_noise), np.maximum(position_noise, 1e-12), 1.0)
+
+
+def curve(world, settings_by_name, recordings, noise, longest=3 * cut.HORIZON, points=15):
+    """[{"seconds": t, name: error at t after the start, ...}]: error against horizon, in noises, up to `longest`."""
+    windows = consecutive(recordings, longest)
+    length = max(w.last - w.first for w in windows) + 1
+    rows = np.unique(np.linspace(1, length - 1, min(points, length - 1)).round().astype(int))
+    sample = np.median([(w.recording.time[w.last] - w.recording.time[w.first]) / (w.last - w.first) for w in windows])
+    out = [{"seconds": float(r * sample)} for r in rows]
+    for name, settings in settings_by_name.items():
+        gap = cut.position_residual(world.model, windows, predict(world, settings, windows)[0]) / noise
+        with np.errstate(invalid="ignore"):
+            for row, entry in zip(rows, out):
+                entry[name] = _rms(gap[:, row])
+    return out
+
+
+def _rms(x):
+    x = x[np.isfinite(x)]
+    return float(np.sqrt(np.mean(x**2))) if len(x) else None
+
+
+def traces(world, settings, recordings, horizon=cut.HORIZON, most=3):
+    """[{recording, channel, time, measured, nominal, corrected}] of held-out data; predictions break (NaN) at window starts."""
+    out, model = [], world.model
+    for recording in recordings[:most]:
+        windows = cut.consecutive(recording, horizon)
+        lines = [_stitched(predict(world, s, windows)[0], windows) for s in ({}, settings)]
+        rows = np.concatenate([np.arange(w.first, w.last + 1) for w in windows])
+        for j, _, q, _ in cut.joint_slices(model):
+            for i in range(q.start, q.stop):
+                if not np.isfinite(recording.qpos[:, i]).any():
+                    continue
+                name = "qpos:" + cut.joint_name(model, j) + (f":{i - q.start}" if q.stop - q.start > 1 else "")
+                out.append({"recording": recording.name, "channel": name, "time": recording.time[rows],
+                            "measured": recording.qpos[rows, i], "nominal": lines[0][:, i], "corrected": lines[1][:, i]})
+    return out
+
+
+def _stitched(qpos, windows):
+    pieces = [qpos[i, :w.last - w.first + 1].copy() for i, w in enumerate(windows)]
+    for piece in pieces:
+        piece[0] = np.nan
+    return np.concatenate(pieces)

@@ -1,0 +1,236 @@
+"""The statistical method: which physics a simulator lacks, where, how large, and how sure.
+
+    diagnosis = identify(world, train, held_out)     # physics.World, lists of recordings.Recording
+    diagnosis.summary["findings"]; diagnosis.corrected_xml
+
+1. Noise from differences of the recordings and from short windows that the nominal model can follow.
+2. Windows short enough that the nominal model's misfit stays moderate; start states by Levenberg-Marquardt.
+3. Search over all candidates (selection.Search), again with longer windows until the misfit allows 0.3 s.
+4. Final refit on more windows: intervals from the sandwich covariance between clusters of windows.
+5. What could stand in each finding's place; what is left unexplained.
+Held-out recordings enter only after everything is chosen and fitted.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import evidence
+import scores
+import selection
+import shooting
+import windows as cut
+from recordings import RecordingError
+
+SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
+FINAL_STEPS = 30000
+LEAST_ROWS = 8  # of a window
+FOLLOWS = 12.0  # residual, in noises, above which windows are shortened
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    summary: dict  # diagnosis.json
+    corrected_xml: str
+    world: object
+    settings: dict  # {Candidate: values}
+    ranking: list
+    traces: list
+    residuals: list
+    advice: list
+    unknown_curves: list = field(default_factory=list)
+
+
+def identify(world, train, held_out, progress=None):
+    """Diagnose a simulator from recordings.
+
+    world: physics.World; train, held_out: lists of Recording (held_out is used for nothing but the final figures).
+    progress(done, message): called with the share done, 0..1. Raises RecordingError where the data say too little.
+    """
+    say = progress or (lambda done, message: None)
+    say(0.0, "estimating noise")
+    position_noise, velocity_noise = noise_of(world, train)
+    say(0.1, "first windows")
+    spans = spans_for(world, train, position_noise, velocity_noise)
+    hypothesis, ranking = shooting.Hypothesis(), []
+    for i, span in enumerate(spans):
+        problem = problem_of(world, train, span, SEARCH_STEPS, position_noise, velocity_noise)
+        say(0.1 + 0.5 * i / len(spans), f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
+        search = selection.Search(world, problem, train)
+        fit = shooting.fit_starts(problem, hypothesis)
+        if hypothesis.effects:
+            [fit] = shooting.solve(problem, [hypothesis], fit)
+            fit = search.drop(fit, ())
+        fit, _ = search.run(fit)
+        hypothesis = fit.hypothesis
+        ranking = ranking or search.ranking
+    say(0.6, "alternatives")
+    replaced = {c: also_possible(fit, search.alternatives(fit, c)) for c in fit.hypothesis.candidates}
+    say(0.8, "intervals")
+    final = problem_of(world, train, spans[-1], FINAL_STEPS, position_noise, velocity_noise)
+    fit = shooting.fit_starts(final, hypothesis)
+    if hypothesis.effects:
+        [fit] = shooting.solve(final, [hypothesis], fit)
+    say(0.9, "held-out error")
+    return assemble(world, train, held_out, fit, selection.Search(world, final, train), replaced, ranking,
+                    position_noise, velocity_noise)
+
+
+# ---- data --------------------------------------------------------------------------------------
+
+
+def noise_of(world, train):
+    """Position and velocity noise per dof, (nv,), (nv,): differences, lowered where short windows fit better."""
+    position, velocity = cut.measurement_noise(world.model, train)
+    if not np.isfinite(position).any() and not np.isfinite(velocity).any():
+        raise RecordingError("not enough data: recordings need at least ten measured rows in some qpos column")
+    return position, velocity
+
+
+def windows_for(world, recordings, span, steps):
+    """Windows of span seconds spread evenly over the recordings, at most `steps` simulated steps in all."""
+    every = []
+    for r in recordings:
+        sample = np.median(np.diff(r.time))
+        every += cut.consecutive(r, max(span, LEAST_ROWS * sample))
+    duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
+    number = max(24, int(steps * world.model.opt.timestep / duration))
+    return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]
+
+
+def problem_of(world, recordings, span, steps, position_noise, velocity_noise):
+    return shooting.Problem(world, windows_for(world, recordings, span, steps), position_noise, velocity_noise)
+
+
+def misfit(problem, fit):
+    """Residual in noises: the median over windows, which a few impacts do not move."""
+    rows = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
+    return float(np.sqrt(np.median(fit.chi2 / rows)))
+
+
+def spans_for(world, train, position_noise, velocity_noise):
+    """Window spans to search with, the first short enough for the nominal model to follow, the last the reported horizon."""
+    spans, span = [], cut.HORIZON
+    sample = np.median([np.median(np.diff(r.time)) for r in train])
+    while True:
+        spans.insert(0, span)
+        problem = problem_of(world, train, span, SEARCH_STEPS / 4, position_noise, velocity_noise)
+        if misfit(problem, shooting.fit_starts(problem, shooting.Hypothesis())) < FOLLOWS or span / 2 < 1.5 * LEAST_ROWS * sample:
+            return spans if len(spans) < 3 else [spans[0], spans[-1]]
+        span /= 2
+
+
+# ---- report ------------------------------------------------------------------------------------
+
+
+def intervals(search, fit):
+    """{candidate: [(low, high), ...]}: 95 %, from the spread between clusters of windows."""
+    if not fit.hypothesis.effects:
+        return {}
+    slope, moves = search.slopes(fit)
+    scan = shooting.project(search.problem, fit, slope, search.pieces)
+    gram, score = scores.summed(search.labels, scan.gram), scores.summed(search.labels, scan.score)
+    covariance = scores.sandwich(gram, score, np.zeros(len(moves))) * moves[:, None] * moves
+    half = scores.t_quantile(max(len(gram) - len(moves), 1)) * np.sqrt(np.diag(covariance))
+    out, at = {}, 0
+    for c, values in fit.hypothesis.effects:
+        out[c] = [(max(v - h, p.low), min(v + h, p.high)) for v, h, p in zip(values, half[at:], c.parameters)]
+        at += len(values)
+    return out
+
+
+def place_of(candidate):
+    return {"kind": candidate.place.kind, "name": candidate.place.name}
+
+
+def parameters_of(candidate, values, bounds=None):
+    out = []
+    for i, (p, v) in enumerate(zip(candidate.parameters, values)):
+        entry = {"name": p.name, "nominal": float(p.nominal), "value": float(v), "unit": p.unit}
+        if bounds:
+            entry["low"], entry["high"] = (float(b) for b in bounds[i])
+        out.append(entry)
+    return out
+
+
+def noise_by_channel(model, position_noise):
+    return {name: float(np.sqrt(np.mean(position_noise[dofs] ** 2))) for name, dofs in cut.channels(model).items()
+            if np.isfinite(position_noise[dofs]).all()}
+
+
+def assemble(world, train, held_out, fit, search, replaced, ranking, position_noise, velocity_noise):
+    settings, model = fit.hypothesis.settings, world.model
+    noise = evidence.reporting_noise(position_noise)
+    bounds = intervals(search, fit)
+    held = held_out or train
+    before, after = (evidence.prediction_error(world, s, held, noise)[0] for s in ({}, settings))
+    findings = []
+    xml, written = world.corrected_xml(settings)
+    for candidate, values in fit.hypothesis.effects:
+        without = evidence.prediction_error(world, fit.hypothesis.minus(candidate).settings, held, noise)[0]
+        findings.append({
+            "effect": candidate.effect.name, "place": place_of(candidate),
+            "parameters": parameters_of(candidate, values, bounds[candidate]),
+            "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
+                         "p_value": search.significance(fit, (candidate,))},
+            "depends_on": depends_on(candidate), "when": None, "written_as": written[candidate],
+            "also_possible": replaced[candidate]})
+    findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
+    figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
+               "held_out": figure(world, settings, held, position_noise, velocity_noise)}
+    figures["held_out"]["horizon_s"] = cut.HORIZON
+    figures["held_out"]["curve"] = evidence.curve(world, {"before": {}, "after": settings}, held, noise)
+    floor = figures["held_out"]["floor"]
+    summary = {"format": 1, "verdict": "mismatch" if findings else "match",
+               "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,
+               "unexplained": {"fraction": float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1)),
+                               "place": None, "depends_on": []}}
+    return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
+                     [], [], [])
+
+
+def figure(world, settings, recordings, position_noise, velocity_noise):
+    noise, channels, out = evidence.reporting_noise(position_noise), {}, {}
+    for name, s in (("before", {}), ("after", settings)):
+        out[name], per_channel = evidence.prediction_error(world, s, recordings, noise)
+        for channel, value in per_channel.items():
+            channels.setdefault(channel, {})[name] = value
+    out["floor"], per_channel = evidence.floor_error(world, settings, recordings, position_noise, velocity_noise)
+    for channel, value in per_channel.items():
+        channels[channel]["floor"] = value
+        channels[channel]["unit"] = unit_of(world.model, channel)
+    out["channels"] = channels
+    return out
+
+
+def unit_of(model, channel):
+    for j, kind, _, _ in cut.joint_slices(model):
+        name = "qpos:" + cut.joint_name(model, j)
+        if channel == name + ":pos" or (channel == name and kind.name == "mjJNT_SLIDE"):
+            return "m"
+    return "rad"
+
+
+def depends_on(candidate):
+    return list(getattr(candidate.effect, "depends_on", lambda place: [])(candidate.place)) if hasattr(
+        candidate.effect, "depends_on") else []
+
+
+def also_possible(fit, others, most=3):
+    """Other effects that bring the squared residual to within 5 % in error of the chosen one's."""
+    best = [(f, c) for f, c in others if f.chi2.sum() < (1 + selection.SAME) ** 2 * fit.chi2.sum()]
+    return [{"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, f.hypothesis.settings[c])}
+            for f, c in best[:most]]
+
+
+def ranking_rows(trials, fit):
+    """Best option of every candidate in the first scan: share of the squared residual it removes, and its p-value."""
+    rows, seen = [], set()
+    for t in trials:
+        c = t.option.candidate
+        if c in seen:
+            continue
+        seen.add(c)
+        rows.append({"effect": c.effect.name, "place": place_of(c), "error_removed": float(t.gain / t.chi2), "p_value": t.p_value,
+                     "chosen": c in fit.hypothesis.candidates})
+    return rows[:40]

@@ -1,0 +1,281 @@
+"""Which effects? Scan all candidates, refit the best few (alone and in pairs), keep, drop, swap, until nothing earns its keep.
+
+    search = Search(world, problem, recordings)
+    fit, steps = search.run()           # shooting.Fit of the chosen hypothesis, one Step per addition
+    search.alternatives(fit, effect)    # what could stand in an effect's place
+
+An effect is added when its gain is significant after correction for the number of candidates (clusters of windows,
+scores.wald), when clusters that its value was not fitted to gain too, and when the residual falls noticeably.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import scores
+import shooting
+
+ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
+WORTH = 0.03  # least fall of the squared residual, of what is there, that an effect must bring
+SAME = 0.05  # effects whose refits differ by less than this in error cannot be told apart
+
+
+@dataclass(frozen=True)
+class Option:
+    """A way to try a candidate: columns along `directions` (values at which to simulate), refitted from `start`."""
+
+    candidate: object
+    directions: tuple
+    linear: bool  # the linear estimate is a good start; else the direction itself is
+
+
+@dataclass
+class Trial:
+    """An option's score: gain in chi2, p-value, gain in unseen clusters, where to start a refit."""
+
+    option: Option
+    gain: float
+    p_value: float
+    held: float
+    start: tuple
+    columns: list  # of the scan
+    chi2: float  # before
+
+
+@dataclass
+class Step:
+    """One accepted addition: which effects came, and the ranking that led there."""
+
+    added: tuple
+    p_value: float
+    chi2: float
+    ranking: list = field(default_factory=list)
+
+
+def options_of(world, recordings):
+    out = []
+    for candidate in world.candidates:
+        nominal = np.array([p.nominal for p in candidate.parameters])
+        probes = world.probes(candidate, recordings)
+        for probe in probes:
+            out.append(Option(candidate, (tuple(probe),), False))
+        if len(probes) == 0:
+            moves = shooting.perturbed(shooting.Hypothesis(((candidate, tuple(nominal)),)))[0]
+            out.append(Option(candidate, tuple(tuple(m[candidate]) for m in moves), True))
+    return out
+
+
+class Search:
+    def __init__(self, world, problem, recordings, progress=None):
+        self.world, self.problem = world, problem
+        self.options = options_of(world, recordings)
+        self.places = len({o.candidate for o in self.options})
+        labels = scores.clusters(problem.windows)
+        count = labels.max() + 1
+        self.pieces = 1 if count >= 16 else min(-(-16 // count), max(problem.weight.shape[1] // 4, 1))
+        if self.pieces > 1:
+            labels = np.arange(len(problem.windows) * self.pieces)
+        self.labels = labels
+        self.progress = progress or (lambda message: None)
+        self.ranking = []
+
+    # ---- linear scan ---------------------------------------------------------------------------
+
+    def reduced(self, fit, settings):
+        """Cluster sums (C, k, k), (C, k) of columns with start states and the fit's own parameters projected out; chi2."""
+        base, moves = shooting.perturbed(fit.hypothesis)
+        slope = shooting.columns(self.problem, [fit], [base + settings])[0]
+        scan = shooting.project(self.problem, fit, slope, self.pieces)
+        gram, score = scores.summed(self.labels, scan.gram), scores.summed(self.labels, scan.score)
+        k = len(base)
+        if k:
+            total, pull = gram.sum(0), score.sum(0)
+            size = np.sqrt(np.maximum(np.diag(total)[:k], 1e-300))
+            block = total[:k, :k] / size / size[:, None] + 1e-9 * np.eye(k)
+            share = np.linalg.solve(block, total[:k, k:] / size[:, None]) / size[:, None]  # (k, K)
+            own = np.linalg.solve(block, pull[:k] / size) / size
+            # remove what the own parameters take up: residual first, then columns
+            score = score - gram[:, :, :k] @ own
+            mixed = gram[:, k:, :k]
+            score = score[:, k:] - score[:, :k] @ share
+            gram = (gram[:, k:, k:] - mixed @ share - np.swapaxes(mixed @ share, 1, 2)
+                    + share.T @ gram[:, :k, :k] @ share)
+        return gram, score, float(scan.chi2.sum())
+
+    def trials(self, fit):
+        """All options not yet in the hypothesis, best gain first; and the cluster sums of their columns."""
+        options = [o for o in self.options if o.candidate not in fit.hypothesis.candidates]
+        settings, where = [], []
+        for option in options:
+            where.append(range(len(settings), len(settings) + len(option.directions)))
+            settings += [fit.hypothesis.plus(option.candidate, d).settings for d in option.directions]
+        gram, score, chi2 = self.reduced(fit, settings)
+        own = np.array([np.diag(g) for g in gram]).sum(0)
+        out = []
+        for option, mine in zip(options, where):
+            columns = [c for c in mine if own[c] > 1e-6]  # a change of less than a thousandth of the noise is none
+            if not columns:
+                continue
+            pick = np.ix_(range(len(gram)), columns, columns)
+            value, gain, p, held = scores.wald(gram[pick], score[:, columns])
+            start = self.start_of(option, columns, mine, value)
+            if start is None:
+                continue
+            out.append(Trial(option, gain, p, float(held.sum()), start, columns, chi2))
+        out.sort(key=lambda t: -t.gain)
+        return out, gram, score, chi2
+
+    def start_of(self, option, columns, where, value):
+        """Parameter values of the linear estimate inside the bounds; None where it points out of them."""
+        parameters = option.candidate.parameters
+        nominal = np.array([p.nominal for p in parameters])
+        low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
+        if not option.linear:
+            return option.directions[0] if value[0] > 0 else None
+        move = sum(v * (np.array(option.directions[c - where[0]]) - nominal) for c, v in zip(columns, value))
+        start = np.clip(nominal + move, low, high)
+        if np.all(np.abs(start - nominal) < 1e-3 * np.abs(move)):
+            return None
+        return tuple(start)
+
+    def pairs(self, trials, gram, score, among=10):
+        """Gains of pairs of options, best first: [(gain, trial, trial)]. One of the two is among the best singles."""
+        total, pull, out = gram.sum(0), score.sum(0), []
+        for i, a in enumerate(trials[:among]):
+            for b in trials[i + 1:]:
+                if b.option.candidate == a.option.candidate:
+                    continue
+                columns = a.columns + b.columns
+                block = total[np.ix_(columns, columns)]
+                gain = float(pull[columns] @ scores.solve_small(block, pull[columns]))
+                out.append((gain, a, b))
+        out.sort(key=lambda t: -t[0])
+        return out
+
+    # ---- nonlinear search ----------------------------------------------------------------------
+
+    def run(self, fit, most=6, singles=5, doubles=2):
+        """Additions, drops and swaps from the nominal fit: (Fit, [Step])."""
+        steps = []
+        for _ in range(most):
+            trials, gram, score, chi2 = self.trials(fit)
+            if not self.ranking:
+                self.ranking = trials
+            level = ALPHA / self.places
+            hopeful = [t for t in trials if t.p_value < 10 * level and t.held > 0 and t.gain > 0.3 * WORTH * chi2]
+            proposals = [(t,) for t in self.spread(hopeful, gram, singles)]
+            best = trials[0].gain if trials else 0.0
+            proposals += [(a, b) for gain, a, b in self.pairs(trials, gram, score)[:doubles]
+                          if gain > best + max(WORTH * chi2, 0.1 * best)]
+            if not proposals:
+                break
+            hypotheses = []
+            for proposal in proposals:
+                h = fit.hypothesis
+                for t in proposal:
+                    h = h.plus(t.option.candidate, t.start)
+                hypotheses.append(h)
+            self.progress(f"refitting {len(hypotheses)} hypotheses")
+            fits = shooting.solve(self.problem, hypotheses, fit)
+            chosen = self.choose(fit, fits, proposals)
+            if chosen is None:
+                break
+            new, added, p = chosen
+            steps.append(Step(added, p, float(new.chi2.sum()), trials))
+            fit = self.drop(new, added)
+        return fit, steps
+
+    def spread(self, trials, gram, number):
+        """The best few trials, no two of which have the same column."""
+        total, out = gram.sum(0), []
+        for t in trials:
+            for other in out:
+                if len(t.columns) == len(other.columns) == 1:
+                    i, j = t.columns[0], other.columns[0]
+                    if abs(total[i, j]) > 0.998 * np.sqrt(total[i, i] * total[j, j]):
+                        break
+            else:
+                out.append(t)
+            if len(out) == number:
+                break
+        return out
+
+    def significance(self, fit, candidates):
+        """p-value of "these effects are absent" at a fit, its other parameters free."""
+        slope, moves = self.slopes(fit)
+        scan = shooting.project(self.problem, fit, slope, self.pieces)
+        gram, score = scores.summed(self.labels, scan.gram), scores.summed(self.labels, scan.score)
+        vector = fit.hypothesis.vector
+        keep = np.array([c in candidates for c, values in fit.hypothesis.effects for _ in values])
+        nominal = np.array([p.nominal for p in fit.hypothesis.parameters])
+        value = (vector - nominal) / moves
+        covariance = scores.sandwich(gram, score, np.zeros(len(vector)))  # at the optimum the scores are the residue
+        block = covariance[np.ix_(keep, keep)]
+        size = np.sqrt(np.maximum(np.diag(block), 1e-300))
+        k, count = keep.sum(), len(gram)
+        if count <= k + 1:
+            return 1.0
+        whitened = np.linalg.solve(block / size / size[:, None] + 1e-6 * np.eye(k), value[keep] / size)
+        statistic = float(value[keep] / size @ whitened) / k * (count - k) / (count - 1)
+        return scores.f_survival(statistic, k, count - k)
+
+    def slopes(self, fit):
+        settings, moves = shooting.perturbed(fit.hypothesis)
+        return shooting.columns(self.problem, [fit], [settings])[0], moves
+
+    def per_cluster(self, fit):
+        per_window = np.repeat(fit.chi2 / self.pieces, self.pieces) if self.pieces > 1 else fit.chi2
+        return scores.summed(self.labels, per_window)
+
+    def choose(self, fit, fits, proposals):
+        """The refit that wins, as (Fit, added candidates, p-value); None when none earns its keep."""
+        level, out = ALPHA / self.places, []
+        for new, proposal in zip(fits, proposals):
+            added = tuple(t.option.candidate for t in proposal)
+            fall = 1 - new.chi2.sum() / fit.chi2.sum()
+            if fall < WORTH * len(added):
+                continue
+            p = max(self.significance(new, (c,)) for c in added)
+            if p < level:
+                out.append((new, added, p))
+        if not out:
+            return None
+        singles = [o for o in out if len(o[1]) == 1]
+        winner = min(out, key=lambda o: o[0].chi2.sum())
+        if len(winner[1]) == 2 and singles:
+            # a pair wins only over what a single leaves for a second step
+            single = min(singles, key=lambda o: o[0].chi2.sum())
+            if winner[0].chi2.sum() > 0.7 * single[0].chi2.sum():
+                winner = single
+        return winner
+
+    def drop(self, fit, added):
+        """Leave out earlier effects that no longer earn their keep."""
+        while True:
+            earlier = [c for c in fit.hypothesis.candidates if c not in added]
+            if not earlier:
+                return fit
+            fits = shooting.solve(self.problem, [fit.hypothesis.minus(c) for c in earlier], fit)
+            costs = np.array([f.chi2.sum() for f in fits]) / fit.chi2.sum() - 1
+            weak = [i for i in range(len(fits))
+                    if costs[i] < WORTH or self.significance(fit, (earlier[i],)) > ALPHA / self.places]
+            if not weak:
+                return fit
+            fit = fits[min(weak, key=lambda i: costs[i])]
+
+    def alternatives(self, fit, candidate, most=8):
+        """Refits with another effect in a candidate's place, lowest chi2 first: [(Fit, other candidate)]."""
+        [without] = shooting.solve(self.problem, [fit.hypothesis.minus(candidate)], fit)
+        trials, _, _, _ = self.trials(without)
+        best = next((t.gain for t in trials if t.option.candidate == candidate), trials[0].gain if trials else 0)
+        others, seen = [], set()
+        for t in trials:
+            if t.option.candidate != candidate and t.option.candidate not in seen and t.gain > 0.7 * best:
+                others.append(t)
+                seen.add(t.option.candidate)
+        others = others[:most]
+        if not others:
+            return []
+        fits = shooting.solve(self.problem, [without.hypothesis.plus(t.option.candidate, t.start) for t in others], without)
+        out = [(f, t.option.candidate) for f, t in zip(fits, others)]
+        return sorted(out, key=lambda o: o[0].chi2.sum())

@@ -1,0 +1,352 @@
+"""Multiple shooting: many hypotheses fitted to many windows at once, each window with a start state of its own.
+
+    problem = Problem(world, windows, position_noise, velocity_noise)
+    [fit] = solve(problem, [Hypothesis()])                        # start states alone
+    scan = linearise(problem, fit, [{coulomb: (0.1,)}, ...])      # one column per perturbed setting
+    fits = solve(problem, [Hypothesis(((coulomb, (0.1,)),)), ...], warm=fit)
+
+A residual is (measured - predicted) / noise. Start states are eliminated window by window (variable projection), so
+that what is left of a residual, and of a column, is what no choice of start states can produce.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import windows as cut
+
+BLOWN_UP = 1e3  # residual, in noises, of a prediction that is not finite
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Effects and their values: ((candidate, (value, ...)), ...)."""
+
+    effects: tuple = ()
+
+    @property
+    def settings(self):
+        return dict(self.effects)
+
+    @property
+    def candidates(self):
+        return tuple(c for c, _ in self.effects)
+
+    @property
+    def vector(self):
+        return np.array([v for _, values in self.effects for v in values], float)
+
+    @property
+    def parameters(self):
+        return [p for c, _ in self.effects for p in c.parameters]
+
+    def moved(self, vector):
+        out, at = [], 0
+        for c, values in self.effects:
+            out.append((c, tuple(float(v) for v in vector[at:at + len(values)])))
+            at += len(values)
+        return Hypothesis(tuple(out))
+
+    def plus(self, candidate, values):
+        kept = tuple(e for e in self.effects if e[0] != candidate)
+        return Hypothesis(kept + ((candidate, tuple(float(v) for v in values)),))
+
+    def minus(self, candidate):
+        return Hypothesis(tuple(e for e in self.effects if e[0] != candidate))
+
+
+@dataclass
+class Fit:
+    hypothesis: Hypothesis
+    qpos: np.ndarray  # (W, nq) start states
+    qvel: np.ndarray  # (W, nv)
+    residual: np.ndarray  # (W, m)
+    start_jacobian: np.ndarray  # (W, m, 2 nv), of the prediction
+
+    @property
+    def chi2(self):
+        """(W,) squared residual of every window."""
+        return (self.residual**2).sum(1)
+
+
+class Problem:
+    """Windows with their measurements and noises; turns states and settings into residuals."""
+
+    def __init__(self, world, windows, position_noise, velocity_noise):
+        self.world, self.model, self.windows = world, world.model, list(windows)
+        nv = self.model.nv
+        self.measured_qpos = cut.measured(self.windows, "qpos")
+        self.measured_qvel = cut.measured(self.windows, "qvel")
+        # A scale, not a noise: it stays clear of zero where the noise is far below what any model can explain.
+        spread = np.nanmedian(np.nanstd(self.measured_qpos, axis=1), axis=0) if self.model.nq == nv else np.zeros(nv)
+        position_noise = np.maximum(position_noise, 1e-3 * np.nan_to_num(spread))
+        known = np.isfinite(cut.difference(self.model, self.measured_qpos, self.measured_qpos))
+        self.weight = np.concatenate([known / position_noise, np.isfinite(self.measured_qvel) / velocity_noise], -1)
+        self.weight[~np.isfinite(self.weight)] = 0.0
+        self.guess_qpos, self.guess_qvel = cut.recorded_starts(self.model, self.windows)
+        # Wide priors on the start states: they only decide what the measurements leave open.
+        sample = np.median([np.median(np.diff(w.recording.time)) for w in self.windows])
+        speed = np.sqrt(np.mean(self.guess_qvel**2, axis=0)) + 1e-3
+        finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
+        self.start_scale = np.concatenate([np.where(finite > 0, 20 * finite, 1.0),
+                                           np.maximum(20 * finite / sample, speed)])  # (2 nv,)
+        span = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in self.windows])
+        small = np.where(finite > 0, finite, 1e-4)
+        self.start_step = np.concatenate([0.5 * small, 0.5 * small / span])
+        self.rows = int(self.weight.astype(bool).sum())
+        self.size = self.weight[0].size + 2 * nv
+
+    def subset(self, keep):
+        out = object.__new__(Problem)
+        out.__dict__.update(self.__dict__)
+        out.windows = [self.windows[i] for i in keep]
+        for name in ("measured_qpos", "measured_qvel", "weight", "guess_qpos", "guess_qvel"):
+            setattr(out, name, getattr(self, name)[keep])
+        out.rows = int(out.weight.astype(bool).sum())
+        return out
+
+    def residuals(self, settings, which, qpos, qvel):
+        """(S, m): S simulations, the i-th in window which[i] under settings[i] from (qpos[i], qvel[i])."""
+        which = np.asarray(which)
+        predicted_qpos, predicted_qvel = self.world.simulate(settings, qpos, qvel, [self.windows[i] for i in which])
+        with np.errstate(invalid="ignore", over="ignore"):
+            gap = np.concatenate([cut.difference(self.model, predicted_qpos, self.measured_qpos[which]),
+                                  self.measured_qvel[which] - predicted_qvel], -1)
+            weight = self.weight[which]
+            residual = np.where(weight > 0, gap * weight, 0.0)
+            blown = ~np.isfinite(residual).all((1, 2)) | (np.abs(residual).max((1, 2)) > BLOWN_UP * 100)
+        residual = np.clip(np.nan_to_num(residual, nan=BLOWN_UP, posinf=BLOWN_UP, neginf=-BLOWN_UP), -100 * BLOWN_UP, 100 * BLOWN_UP)
+        residual[blown & ~np.isfinite(gap).all((1, 2))] = BLOWN_UP
+        prior = np.concatenate([cut.difference(self.model, qpos, self.guess_qpos[which]), self.guess_qvel[which] - qvel], -1)
+        return np.concatenate([residual.reshape(len(which), -1), prior / self.start_scale], 1)
+
+    def moved(self, qpos, qvel, step):
+        """Start states moved by step (S, 2 nv)."""
+        nv = self.model.nv
+        return cut.integrate(self.model, qpos, step[:, :nv]), qvel + step[:, nv:]
+
+    def start_jacobians(self, settings, which, qpos, qvel, residual):
+        """(S, m, 2 nv): change of the prediction with the start state, one-sided differences."""
+        n, m = len(which), 2 * self.model.nv
+        steps = np.tile(np.diag(self.start_step), (n, 1))
+        big_qpos, big_qvel = self.moved(np.repeat(qpos, m, 0), np.repeat(qvel, m, 0), steps)
+        moved = self.residuals([s for s in settings for _ in range(m)], np.repeat(which, m), big_qpos, big_qvel)
+        slope = (residual[:, None] - moved.reshape(n, m, -1)) / self.start_step[:, None]
+        return np.swapaxes(slope, 1, 2)
+
+
+def _eliminate(jacobian, damping):
+    """Inverse normal matrices of the start states, (W, 2 nv, 2 nv), damped per window."""
+    normal = np.swapaxes(jacobian, 1, 2) @ jacobian
+    diagonal = np.einsum("wii->wi", normal)
+    diagonal += damping[:, None] * diagonal + 1e-9
+    return np.linalg.inv(normal)
+
+
+def fit_starts(problem, hypothesis, qpos=None, qvel=None, iterations=8):
+    """Start states of all windows under one hypothesis, by Levenberg-Marquardt, damped window by window."""
+    every, settings = np.arange(len(problem.windows)), hypothesis.settings
+    qpos = problem.guess_qpos.copy() if qpos is None else qpos.copy()
+    qvel = problem.guess_qvel.copy() if qvel is None else qvel.copy()
+    residual = problem.residuals([settings] * len(every), every, qpos, qvel)
+    jacobian = problem.start_jacobians([settings] * len(every), every, qpos, qvel, residual)
+    damping, active = np.full(len(every), 1e-3), every
+    for _ in range(iterations):
+        inverse = _eliminate(jacobian[active], damping[active])
+        step = np.einsum("wij,wmj,wm->wi", inverse, jacobian[active], residual[active])
+        new_qpos, new_qvel = problem.moved(qpos[active], qvel[active], step)
+        new = problem.residuals([settings] * len(active), active, new_qpos, new_qvel)
+        old_cost, new_cost = (residual[active] ** 2).sum(1), (new**2).sum(1)
+        better = new_cost < old_cost
+        gained = better & (old_cost - new_cost > 1e-3 * old_cost)
+        good = active[better]
+        qpos[good], qvel[good], residual[good] = new_qpos[better], new_qvel[better], new[better]
+        damping[active] = np.where(better, damping[active] / 10, damping[active] * 10)
+        again = active[gained]
+        if len(again):
+            jacobian[again] = problem.start_jacobians([settings] * len(again), again, qpos[again], qvel[again], residual[again])
+        active = active[gained | (~better & (damping[active] < 1e3))]
+        if not len(active):
+            break
+    return Fit(hypothesis, qpos, qvel, residual, jacobian)
+
+
+# ---- hypotheses with parameters ----------------------------------------------------------------
+
+
+def perturbed(hypothesis):
+    """One setting per parameter with that parameter moved by its step, away from a bound; and the moves (k,)."""
+    vector, out, moves = hypothesis.vector, [], []
+    for i, p in enumerate(hypothesis.parameters):
+        move = p.step if vector[i] + p.step <= p.high else -p.step
+        moved = vector.copy()
+        moved[i] += move
+        out.append(hypothesis.moved(moved).settings)
+        moves.append(move)
+    return out, np.array(moves)
+
+
+def columns(problem, fits, settings):
+    """Change of the prediction with each of settings[h] (lists), from the starts of fits[h]: list of (W, m, len)."""
+    which, flat, qpos, qvel = [], [], [], []
+    every = np.arange(len(problem.windows))
+    for fit, listed in zip(fits, settings):
+        for s in listed:
+            flat += [s] * len(every)
+            which.append(every)
+            qpos.append(fit.qpos)
+            qvel.append(fit.qvel)
+    if not flat:
+        return [np.zeros((len(every), problem.size, 0)) for _ in fits]
+    moved = problem.residuals(flat, np.concatenate(which), np.concatenate(qpos), np.concatenate(qvel))
+    moved = moved.reshape(-1, len(every), problem.size)
+    out, at = [], 0
+    for fit, listed in zip(fits, settings):
+        block = fit.residual[None] - moved[at:at + len(listed)]
+        out.append(np.moveaxis(block, 0, -1))
+        at += len(listed)
+    return out
+
+
+def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
+    """Fit hypotheses side by side, every one with start states of its own: list of Fit.
+
+    warm: a Fit whose start states and start Jacobian begin every hypothesis, or a list of them. Parameters stay
+    inside their bounds; a step is damped until the squared residual falls.
+    """
+    warm = warm if isinstance(warm, list) else [warm] * len(hypotheses)
+    every = np.arange(len(problem.windows))
+    number = len(every)
+    current = _evaluate(problem, hypotheses, warm)
+    damping = np.full(len(hypotheses), 1e-3)
+    moving = [h for h in range(len(hypotheses))]
+    for iteration in range(iterations):
+        if not moving:
+            break
+        perturbations = [perturbed(current[h].hypothesis) for h in moving]
+        slopes = columns(problem, [current[h] for h in moving], [p for p, _ in perturbations])
+        proposals = []
+        for h, (_, moves), slope in zip(moving, perturbations, slopes):
+            proposals.append(_propose(current[h], slope / moves, damping[h]))
+        # new parameters, once with moved and once with kept start states: a window takes the better
+        trial = []
+        for h, (vector, step) in zip(moving, proposals):
+            fit, moved = current[h], current[h].hypothesis.moved(vector)
+            trial += [(moved, *problem.moved(fit.qpos, fit.qvel, step)), (moved, fit.qpos, fit.qvel)]
+        residual = problem.residuals([s for t in trial for s in [t[0].settings] * number], np.tile(every, len(trial)),
+                                     np.concatenate([t[1] for t in trial]), np.concatenate([t[2] for t in trial]))
+        residual = residual.reshape(len(trial), number, -1)
+        still, polish = [], []
+        for i, h in enumerate(moving):
+            a, b = 2 * i, 2 * i + 1
+            cost = (residual[[a, b]] ** 2).sum(-1)  # (2, W)
+            pick = np.argmin(cost, 0)
+            old, new = current[h].chi2.sum(), cost.min(0).sum()
+            if new < old:
+                take = lambda x, y: np.where(pick[:, None] == 0, x, y)
+                current[h] = Fit(trial[a][0], take(trial[a][1], trial[b][1]), take(trial[a][2], trial[b][2]),
+                                 np.where(pick[:, None] == 0, residual[a], residual[b]), current[h].start_jacobian)
+                damping[h] = max(damping[h] / 10, 1e-6)
+                polish.append(h)
+            else:
+                damping[h] *= 10
+            if (new < old and old - new > tolerance * old) or (new >= old and damping[h] < 1e2):
+                still.append(h)
+        _polish(problem, current, polish)
+        refresh = [h for h in still if iteration % 2 == 0]
+        if refresh:
+            jacobians = problem.start_jacobians(
+                [s for h in refresh for s in [current[h].hypothesis.settings] * number], np.tile(every, len(refresh)),
+                np.concatenate([current[h].qpos for h in refresh]), np.concatenate([current[h].qvel for h in refresh]),
+                np.concatenate([current[h].residual for h in refresh]))
+            for h, j in zip(refresh, np.split(jacobians, len(refresh))):
+                current[h].start_jacobian = j
+        moving = still
+    return current
+
+
+def _polish(problem, current, which):
+    """One more step of the start states alone, with the Jacobian at hand; kept where it helps."""
+    if not which:
+        return
+    every, moved = np.arange(len(problem.windows)), []
+    for h in which:
+        fit = current[h]
+        inverse = _eliminate(fit.start_jacobian, np.full(len(every), 1e-3))
+        step = np.einsum("wij,wmj,wm->wi", inverse, fit.start_jacobian, fit.residual)
+        moved.append(problem.moved(fit.qpos, fit.qvel, step))
+    residual = problem.residuals([s for h in which for s in [current[h].hypothesis.settings] * len(every)],
+                                 np.tile(every, len(which)), np.concatenate([m[0] for m in moved]),
+                                 np.concatenate([m[1] for m in moved]))
+    for h, (qpos, qvel), r in zip(which, moved, np.split(residual, len(which))):
+        fit = current[h]
+        better = ((r**2).sum(1) < fit.chi2)[:, None]
+        current[h] = Fit(fit.hypothesis, np.where(better, qpos, fit.qpos), np.where(better, qvel, fit.qvel),
+                         np.where(better, r, fit.residual), fit.start_jacobian)
+
+
+def _evaluate(problem, hypotheses, warm):
+    every = np.arange(len(problem.windows))
+    residual = problem.residuals([s for h in hypotheses for s in [h.settings] * len(every)],
+                                 np.tile(every, len(hypotheses)), np.concatenate([f.qpos for f in warm]),
+                                 np.concatenate([f.qvel for f in warm]))
+    return [Fit(h, f.qpos, f.qvel, r, f.start_jacobian)
+            for h, f, r in zip(hypotheses, warm, np.split(residual, len(hypotheses)))]
+
+
+def _propose(fit, slope, damping):
+    """Gauss-Newton step of parameters and start states together, start states eliminated: vector (k,), step (W, 2 nv)."""
+    jacobian, residual = fit.start_jacobian, fit.residual
+    inverse = _eliminate(jacobian, np.full(len(jacobian), damping))
+    cross = np.einsum("wmi,wmk->wik", jacobian, slope)
+    pull = np.einsum("wmi,wm->wi", jacobian, residual)
+    normal = np.einsum("wmk,wml->kl", slope, slope) - np.einsum("wik,wij,wjl->kl", cross, inverse, cross)
+    push = np.einsum("wmk,wm->k", slope, residual) - np.einsum("wik,wij,wj->k", cross, inverse, pull)
+    vector = fit.hypothesis.vector
+    low = np.array([p.low for p in fit.hypothesis.parameters])
+    high = np.array([p.high for p in fit.hypothesis.parameters])
+    free, move = np.ones(len(vector), bool), np.zeros(len(vector))
+    for _ in range(len(vector) + 1):  # parameters that would leave their bounds stop there, the rest follow
+        if not free.any():
+            break
+        size = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))  # parameters differ by many powers of ten
+        block = normal[np.ix_(free, free)] / size / size[:, None] + (damping + 1e-9) * np.eye(free.sum())
+        move[free] = np.linalg.solve(block, (push[free] - normal[np.ix_(free, ~free)] @ move[~free]) / size) / size
+        outside = free & ((vector + move < low) | (vector + move > high))
+        if not outside.any():
+            break
+        move[outside] = np.clip(vector + move, low, high)[outside] - vector[outside]
+        free &= ~outside
+    vector = np.clip(vector + move, low, high)
+    step = np.einsum("wij,wj->wi", inverse, pull - cross @ move)
+    return vector, step
+
+
+@dataclass
+class Scan:
+    """Projected normal equations of many columns, one row per piece of a window (P = W x pieces)."""
+
+    chi2: np.ndarray  # (P,) what is left of the residual
+    score: np.ndarray  # (P, K)
+    gram: np.ndarray  # (P, K, K)
+
+
+def project(problem, fit, slope, pieces=1):
+    """Scan of columns slope (W, m, K) against a fit's residual, start states projected out.
+
+    pieces: a window's rows are summed in this many consecutive pieces (more than one where windows are few).
+    """
+    q, _ = np.linalg.qr(fit.start_jacobian)
+    residual = fit.residual - np.einsum("wmi,wi->wm", q, np.einsum("wmi,wm->wi", q, fit.residual))
+    slope = slope - q @ (np.swapaxes(q, 1, 2) @ slope)
+    number, rows, width = problem.weight.shape
+    owner = np.concatenate([np.repeat(np.arange(rows) * pieces // rows, width), np.zeros(2 * problem.model.nv, int)])
+    chi2, score, gram = [], [], []
+    for piece in range(pieces):
+        mine = owner == piece
+        c, r = slope[:, mine], residual[:, mine]
+        chi2.append((r**2).sum(1))
+        score.append(np.einsum("wmk,wm->wk", c, r))
+        gram.append(np.swapaxes(c, 1, 2) @ c)
+    flat = lambda x: np.stack(x, 1).reshape((number * pieces,) + x[0].shape[1:])
+    return Scan(flat(chi2), flat(score), flat(gram))
