@@ -38,6 +38,8 @@ class Diagnosis:
     traces: list
     residuals: list
     advice: list
+    train: list  # Recordings
+    held_out: list
     unknown_curves: list = field(default_factory=list)
 
 
@@ -65,7 +67,7 @@ def identify(world, train, held_out, progress=None):
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     say(0.6, "alternatives")
-    replaced = {c: also_possible(fit, search.alternatives(fit, c)) for c in fit.hypothesis.candidates}
+    replaced = {c: also_possible(fit.subset(search.few), search.alternatives(fit, c)) for c in fit.hypothesis.candidates}
     say(0.8, "intervals")
     final = problem_of(world, train, spans[-1], FINAL_STEPS, position_noise, velocity_noise)
     fit = shooting.fit_starts(final, hypothesis)
@@ -130,8 +132,10 @@ def intervals(search, fit):
     slope, moves = search.slopes(fit)
     scan = shooting.project(search.problem, fit, slope, search.pieces)
     gram, score = scores.summed(search.labels, scan.gram), scores.summed(search.labels, scan.score)
-    covariance = scores.sandwich(gram, score, np.zeros(len(moves))) * moves[:, None] * moves
-    half = scores.t_quantile(max(len(gram) - len(moves), 1)) * np.sqrt(np.diag(covariance))
+    seen = np.diag(gram.sum(0)) > shooting.UNSEEN
+    covariance = scores.sandwich(gram[:, seen][:, :, seen], score[:, seen], np.zeros(seen.sum()))
+    half = np.full(len(moves), np.inf)
+    half[seen] = scores.t_quantile(max(len(gram) - seen.sum(), 1)) * np.sqrt(np.diag(covariance)) * np.abs(moves[seen])
     out, at = {}, 0
     for c, values in fit.hypothesis.effects:
         out[c] = [(max(v - h, p.low), min(v + h, p.high)) for v, h, p in zip(values, half[at:], c.parameters)]
@@ -172,7 +176,7 @@ def assemble(world, train, held_out, fit, search, replaced, ranking, position_no
             "effect": candidate.effect.name, "place": place_of(candidate),
             "parameters": parameters_of(candidate, values, bounds[candidate]),
             "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
-                         "p_value": search.significance(fit, (candidate,))},
+                         "p_value": search.significance(fit, candidate)[0]},
             "depends_on": depends_on(candidate), "when": None, "written_as": written[candidate],
             "also_possible": replaced[candidate]})
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
@@ -186,7 +190,7 @@ def assemble(world, train, held_out, fit, search, replaced, ranking, position_no
                "unexplained": {"fraction": float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1)),
                                "place": None, "depends_on": []}}
     return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
-                     [], [], [])
+                     [], [], train, held)
 
 
 def figure(world, settings, recordings, position_noise, velocity_noise):

@@ -14,9 +14,11 @@ import numpy as np
 
 import scores
 import shooting
+from probes import values_to_try
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 WORTH = 0.03  # least fall of the squared residual, of what is there, that an effect must bring
+FEW = 24  # windows, at least, of a refit that only has to tell hypotheses apart
 SAME = 0.05  # effects whose refits differ by less than this in error cannot be told apart
 
 
@@ -55,8 +57,10 @@ class Step:
 def options_of(world, recordings):
     out = []
     for candidate in world.candidates:
+        if candidate.effect.timed:
+            continue
         nominal = np.array([p.nominal for p in candidate.parameters])
-        probes = world.probes(candidate, recordings)
+        probes = values_to_try(world.model, candidate, recordings)
         for probe in probes:
             out.append(Option(candidate, (tuple(probe),), False))
         if len(probes) == 0:
@@ -69,6 +73,10 @@ class Search:
     def __init__(self, world, problem, recordings, progress=None):
         self.world, self.problem = world, problem
         self.options = options_of(world, recordings)
+        # refits that only have to tell hypotheses apart use some of the windows
+        few = max(FEW, len(problem.windows) // 4)
+        self.few = np.unique(np.linspace(0, len(problem.windows) - 1, min(few, len(problem.windows))).round().astype(int))
+        self.small = problem.subset(self.few)
         self.places = len({o.candidate for o in self.options})
         labels = scores.clusters(problem.windows)
         count = labels.max() + 1
@@ -113,7 +121,7 @@ class Search:
         own = np.array([np.diag(g) for g in gram]).sum(0)
         out = []
         for option, mine in zip(options, where):
-            columns = [c for c in mine if own[c] > 1e-6]  # a change of less than a thousandth of the noise is none
+            columns = [c for c in mine if own[c] > shooting.UNSEEN]
             if not columns:
                 continue
             pick = np.ix_(range(len(gram)), columns, columns)
@@ -131,7 +139,7 @@ class Search:
         nominal = np.array([p.nominal for p in parameters])
         low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
         if not option.linear:
-            return option.directions[0] if value[0] > 0 else None
+            return option.directions[0] if value[0] > 0.05 else None
         move = sum(v * (np.array(option.directions[c - where[0]]) - nominal) for c, v in zip(columns, value))
         start = np.clip(nominal + move, low, high)
         if np.all(np.abs(start - nominal) < 1e-3 * np.abs(move)):
@@ -176,7 +184,7 @@ class Search:
                     h = h.plus(t.option.candidate, t.start)
                 hypotheses.append(h)
             self.progress(f"refitting {len(hypotheses)} hypotheses")
-            fits = shooting.solve(self.problem, hypotheses, fit)
+            fits = shooting.solve(self.small, hypotheses, fit.subset(self.few), iterations=4)
             chosen = self.choose(fit, fits, proposals)
             if chosen is None:
                 break
@@ -200,24 +208,31 @@ class Search:
                 break
         return out
 
-    def significance(self, fit, candidates):
-        """p-value of "these effects are absent" at a fit, its other parameters free."""
-        slope, moves = self.slopes(fit)
+    def whole(self, fit, candidate):
+        """Cluster sums of the columns [other parameters..., the whole effect from fitted to absent], and chi2.
+
+        The whole effect as one column needs no derivative, which limits and delays lack.
+        """
+        values = dict(fit.hypothesis.effects)[candidate]
+        without = fit.hypothesis.minus(candidate)
+        rest = [{**s, candidate: values} for s in shooting.perturbed(without)[0]]
+        slope = shooting.columns(self.problem, [fit], [rest + [without.settings]])[0]
         scan = shooting.project(self.problem, fit, slope, self.pieces)
         gram, score = scores.summed(self.labels, scan.gram), scores.summed(self.labels, scan.score)
-        vector = fit.hypothesis.vector
-        keep = np.array([c in candidates for c, values in fit.hypothesis.effects for _ in values])
-        nominal = np.array([p.nominal for p in fit.hypothesis.parameters])
-        value = (vector - nominal) / moves
-        covariance = scores.sandwich(gram, score, np.zeros(len(vector)))  # at the optimum the scores are the residue
-        block = covariance[np.ix_(keep, keep)]
-        size = np.sqrt(np.maximum(np.diag(block), 1e-300))
-        k, count = keep.sum(), len(gram)
-        if count <= k + 1:
-            return 1.0
-        whitened = np.linalg.solve(block / size / size[:, None] + 1e-6 * np.eye(k), value[keep] / size)
-        statistic = float(value[keep] / size @ whitened) / k * (count - k) / (count - 1)
-        return scores.f_survival(statistic, k, count - k)
+        seen = np.diag(gram.sum(0)) > shooting.UNSEEN
+        return gram[:, seen][:, :, seen], score[:, seen], float(scan.chi2.sum()), bool(seen[-1])
+
+    def significance(self, fit, candidate):
+        """(p-value of "this effect is absent" at a fit; relative rise of the squared residual without it), others following."""
+        gram, score, chi2, seen = self.whole(fit, candidate)
+        k, count = len(candidate.parameters), len(gram)
+        if not seen or count <= k + 1:
+            return 1.0, 0.0
+        variance = scores.sandwich(gram, score, np.zeros(gram.shape[1]))[-1, -1]  # at the optimum scores are leftovers
+        statistic = 1 / max(variance, 1e-300) / k * (count - k) / (count - 1)
+        total = gram.sum(0)
+        own = total[-1, -1] - total[-1, :-1] @ scores.solve_small(total[:-1, :-1], total[:-1, -1]) if len(total) > 1 else total[0, 0]
+        return scores.f_survival(statistic, k, count - k), float(own / chi2)
 
     def slopes(self, fit):
         settings, moves = shooting.perturbed(fit.hypothesis)
@@ -228,44 +243,43 @@ class Search:
         return scores.summed(self.labels, per_window)
 
     def choose(self, fit, fits, proposals):
-        """The refit that wins, as (Fit, added candidates, p-value); None when none earns its keep."""
-        level, out = ALPHA / self.places, []
-        for new, proposal in zip(fits, proposals):
-            added = tuple(t.option.candidate for t in proposal)
-            fall = 1 - new.chi2.sum() / fit.chi2.sum()
-            if fall < WORTH * len(added):
+        """The hypothesis that wins, refitted to all windows, as (Fit, added candidates, p-value); None when none earns its keep."""
+        level, before = ALPHA / self.places, fit.chi2[self.few].sum()
+        order = sorted(range(len(fits)), key=lambda i: fits[i].chi2.sum())
+        # a pair wins only over what the best single leaves for a second step
+        single = next((i for i in order if len(proposals[i]) == 1), None)
+        if single is not None and len(proposals[order[0]]) == 2:
+            if fits[order[0]].chi2.sum() > 0.7 * fits[single].chi2.sum():
+                order.remove(single)
+                order.insert(0, single)
+        for i in order[:3]:
+            added = tuple(t.option.candidate for t in proposals[i])
+            if 1 - fits[i].chi2.sum() / before < 0.5 * WORTH * len(added):
                 continue
-            p = max(self.significance(new, (c,)) for c in added)
+            [new] = shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4)
+            if 1 - new.chi2.sum() / fit.chi2.sum() < WORTH * len(added):
+                continue
+            p = max(self.significance(new, c)[0] for c in added)
             if p < level:
-                out.append((new, added, p))
-        if not out:
-            return None
-        singles = [o for o in out if len(o[1]) == 1]
-        winner = min(out, key=lambda o: o[0].chi2.sum())
-        if len(winner[1]) == 2 and singles:
-            # a pair wins only over what a single leaves for a second step
-            single = min(singles, key=lambda o: o[0].chi2.sum())
-            if winner[0].chi2.sum() > 0.7 * single[0].chi2.sum():
-                winner = single
-        return winner
+                return new, added, p
+        return None
 
     def drop(self, fit, added):
         """Leave out earlier effects that no longer earn their keep."""
         while True:
-            earlier = [c for c in fit.hypothesis.candidates if c not in added]
-            if not earlier:
-                return fit
-            fits = shooting.solve(self.problem, [fit.hypothesis.minus(c) for c in earlier], fit)
-            costs = np.array([f.chi2.sum() for f in fits]) / fit.chi2.sum() - 1
-            weak = [i for i in range(len(fits))
-                    if costs[i] < WORTH or self.significance(fit, (earlier[i],)) > ALPHA / self.places]
+            earlier = {c: self.significance(fit, c) for c in fit.hypothesis.candidates if c not in added}
+            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * WORTH or p > ALPHA / self.places]
             if not weak:
                 return fit
-            fit = fits[min(weak, key=lambda i: costs[i])]
+            weakest = min(weak, key=lambda c: earlier[c][1])
+            [less] = shooting.solve(self.problem, [fit.hypothesis.minus(weakest)], fit, iterations=4)
+            if less.chi2.sum() > (1 + WORTH) * fit.chi2.sum() and earlier[weakest][0] <= ALPHA / self.places:
+                return fit
+            fit = less
 
     def alternatives(self, fit, candidate, most=8):
         """Refits with another effect in a candidate's place, lowest chi2 first: [(Fit, other candidate)]."""
-        [without] = shooting.solve(self.problem, [fit.hypothesis.minus(candidate)], fit)
+        [without] = shooting.solve(self.problem, [fit.hypothesis.minus(candidate)], fit, iterations=4)
         trials, _, _, _ = self.trials(without)
         best = next((t.gain for t in trials if t.option.candidate == candidate), trials[0].gain if trials else 0)
         others, seen = [], set()
@@ -276,6 +290,6 @@ class Search:
         others = others[:most]
         if not others:
             return []
-        fits = shooting.solve(self.problem, [without.hypothesis.plus(t.option.candidate, t.start) for t in others], without)
-        out = [(f, t.option.candidate) for f, t in zip(fits, others)]
-        return sorted(out, key=lambda o: o[0].chi2.sum())
+        fits = shooting.solve(self.small, [without.hypothesis.plus(t.option.candidate, t.start) for t in others],
+                              without.subset(self.few))
+        return sorted(zip(fits, (t.option.candidate for t in others)), key=lambda o: o[0].chi2.sum())

@@ -15,6 +15,7 @@ import numpy as np
 
 import windows as cut
 
+UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a parameter counts as without effect
 BLOWN_UP = 1e3  # residual, in noises, of a prediction that is not finite
 
 
@@ -67,6 +68,9 @@ class Fit:
     def chi2(self):
         """(W,) squared residual of every window."""
         return (self.residual**2).sum(1)
+
+    def subset(self, keep):
+        return Fit(self.hypothesis, self.qpos[keep], self.qvel[keep], self.residual[keep], self.start_jacobian[keep])
 
 
 class Problem:
@@ -178,7 +182,7 @@ def perturbed(hypothesis):
     """One setting per parameter with that parameter moved by its step, away from a bound; and the moves (k,)."""
     vector, out, moves = hypothesis.vector, [], []
     for i, p in enumerate(hypothesis.parameters):
-        move = p.step if vector[i] + p.step <= p.high else -p.step
+        move = p.step if p.low <= vector[i] + p.step <= p.high else -p.step
         moved = vector.copy()
         moved[i] += move
         out.append(hypothesis.moved(moved).settings)
@@ -227,7 +231,7 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
         slopes = columns(problem, [current[h] for h in moving], [p for p, _ in perturbations])
         proposals = []
         for h, (_, moves), slope in zip(moving, perturbations, slopes):
-            proposals.append(_propose(current[h], slope / moves, damping[h]))
+            proposals.append(_propose(current[h], slope, moves, damping[h]))
         # new parameters, once with moved and once with kept start states: a window takes the better
         trial = []
         for h, (vector, step) in zip(moving, proposals):
@@ -294,8 +298,11 @@ def _evaluate(problem, hypotheses, warm):
             for h, f, r in zip(hypotheses, warm, np.split(residual, len(hypotheses)))]
 
 
-def _propose(fit, slope, damping):
-    """Gauss-Newton step of parameters and start states together, start states eliminated: vector (k,), step (W, 2 nv)."""
+def _propose(fit, slope, moves, damping):
+    """Gauss-Newton step of parameters and start states together, start states eliminated: vector (k,), step (W, 2 nv).
+
+    slope (W, m, k): change of the prediction as each parameter moves by moves (k,).
+    """
     jacobian, residual = fit.start_jacobian, fit.residual
     inverse = _eliminate(jacobian, np.full(len(jacobian), damping))
     cross = np.einsum("wmi,wmk->wik", jacobian, slope)
@@ -305,21 +312,21 @@ def _propose(fit, slope, damping):
     vector = fit.hypothesis.vector
     low = np.array([p.low for p in fit.hypothesis.parameters])
     high = np.array([p.high for p in fit.hypothesis.parameters])
-    free, move = np.ones(len(vector), bool), np.zeros(len(vector))
+    free, move = np.diag(normal) > UNSEEN, np.zeros(len(vector))
     for _ in range(len(vector) + 1):  # parameters that would leave their bounds stop there, the rest follow
         if not free.any():
             break
-        size = np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))  # parameters differ by many powers of ten
+        size = np.sqrt(np.diag(normal)[free])  # parameters differ by many powers of ten
         block = normal[np.ix_(free, free)] / size / size[:, None] + (damping + 1e-9) * np.eye(free.sum())
         move[free] = np.linalg.solve(block, (push[free] - normal[np.ix_(free, ~free)] @ move[~free]) / size) / size
-        outside = free & ((vector + move < low) | (vector + move > high))
+        target = vector + moves * move
+        outside = free & ((target < low) | (target > high))
         if not outside.any():
             break
-        move[outside] = np.clip(vector + move, low, high)[outside] - vector[outside]
+        move[outside] = ((np.clip(target, low, high) - vector) / moves)[outside]
         free &= ~outside
-    vector = np.clip(vector + move, low, high)
     step = np.einsum("wij,wj->wi", inverse, pull - cross @ move)
-    return vector, step
+    return np.clip(vector + moves * move, low, high), step
 
 
 @dataclass

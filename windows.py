@@ -9,19 +9,12 @@ A window is (recording, first row, last row), both rows inside. Position differe
 tangent space of the joints (nv numbers), so that quaternions need no special case further up.
 """
 
-from typing import NamedTuple
-
 import mujoco
 import numpy as np
 
+from world import Window
+
 HORIZON = 0.3  # s, of the error that is reported
-
-
-class Window(NamedTuple):
-    recording: object  # recordings.Recording
-    first: int
-    last: int
-
 
 # ---- joint coordinates -------------------------------------------------------------------------
 
