@@ -50,7 +50,7 @@ def load(paths, model):
     real = [os.path.realpath(path) for path in paths]
     for path, where in zip(paths, real):
         if real.count(where) > 1:
-            raise RecordingError(f"{path}: given twice; name each recording once, and none both for fitting and as held out")
+            raise RecordingError(f"{path}: given twice; name each recording once")
     short = [os.path.basename(where) for where in real]
     recordings = []
     for path, where in zip(paths, real):

@@ -1,0 +1,180 @@
+"""Where does a simulator differ from recordings of the real system, which physics does it lack, and what is it with it?
+
+    python diagnose.py --model sim.xml --recordings real/*.csv [--held-out more/*.csv] --out report/
+    python diagnose.py --env Hopper-v4 --recordings runs/*.npz --out report/
+
+    diagnosis = diagnose("sim.xml", ["run1.csv", "run2.csv"])
+    diagnosis.summary["findings"]
+
+Writes report.html (to look at), diagnosis.json (to compute with) and corrected.xml (to simulate with). Exit status: 0 a
+diagnosis was made, whatever it says; 2 bad input or not enough data, with one line on stderr.
+"""
+import argparse
+import dataclasses
+import os
+import sys
+import warnings
+
+import gymnasium
+import mujoco
+import numpy as np
+from tqdm import tqdm
+
+import recordings as recorded
+import report
+import wording
+from identify import identify
+from world import World
+
+
+class ModelError(ValueError):
+    """The simulator cannot be used. One line: which, why, and what to do."""
+
+    def __init__(self, message):
+        super().__init__(" ".join(str(message).split()))
+
+
+def diagnose(model, recordings, held_out=None, progress=None):
+    """Compare a simulator with recordings of the real system and return a Diagnosis.
+
+    model: MJCF path, gymnasium MuJoCo id, or mujoco.MjSpec. recordings: paths, or Recording objects. held_out: the same,
+    never used for fitting; None keeps back every third recording, or the last 30 % of each where there are fewer than
+    three. progress: called with (fraction done, what is being done).
+    Raises RecordingError, ModelError (both ValueError, one line).
+    """
+    world = _world(model)
+    train, held = _recordings(recordings, held_out, world.model)
+    notes = recorded.check(train + held, world.model)
+    notes += _runs(world.model, train + held)
+    if not held:
+        train, held = split(train)
+    diagnosis = identify(world, train, held, progress=progress)
+    return dataclasses.replace(diagnosis, summary={**diagnosis.summary, "warnings": notes})
+
+
+def split(recordings):
+    """(for fitting, held out): every third recording is kept back, or the last 30 % of each of one or two."""
+    if len(recordings) >= 3:
+        return [r for i, r in enumerate(recordings) if i % 3 != 2], [r for i, r in enumerate(recordings) if i % 3 == 2]
+    parts = []
+    for recording in recordings:
+        cut = int(np.searchsorted(recording.time, recording.time[0] + 0.7 * np.ptp(recording.time)))
+        for rows in (slice(None, cut), slice(cut, None)):
+            if len(recording.time[rows]) < 10:
+                raise recorded.RecordingError(f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} rows; record "
+                                              f"again, longer ({recorded.ENOUGH}), or give --held-out")
+            parts.append(dataclasses.replace(
+                recording, time=recording.time[rows], qpos=recording.qpos[rows], qvel=recording.qvel[rows],
+                ctrl=recording.ctrl[rows], sensors={name: values[rows] for name, values in recording.sensors.items()}))
+    return parts[::2], parts[1::2]
+
+
+def _world(model):
+    """The nominal simulator of an MJCF path, a gymnasium id, or an MjSpec."""
+    if isinstance(model, mujoco.MjSpec):
+        what, make = "the given MjSpec", World
+    elif os.path.exists(model := os.fspath(model)) or model.endswith(".xml"):
+        what, make = model, World.load
+        if not os.path.isfile(model):
+            raise ModelError(f"{model}: no such model file; check the path")
+    else:
+        what, make = model, World.from_env
+    try:
+        world = make(model)
+    except (ValueError, OSError, TypeError, AttributeError, ImportError, mujoco.FatalError, gymnasium.error.Error) as error:
+        do = "correct the file" if make is World.load else "give the id of a gymnasium MuJoCo environment, or --model file.xml"
+        raise ModelError(f"{what}: the model does not load ({error}); {do}") from None
+    if world.model.nq == 0:
+        raise ModelError(f"{what}: the model has no joints, so nothing in it can move; give the model of the recorded mechanism")
+    return world
+
+
+def _recordings(recordings, held_out, model):
+    """Both lists as Recording objects, with names that tell them apart, and none in both."""
+    given, more = ([x] if isinstance(x, (str, os.PathLike, recorded.Recording)) else list(x or []) for x in (recordings, held_out))
+    if not given:
+        raise recorded.RecordingError("no recordings given: name at least one CSV or NPZ file")
+    if any(isinstance(x, recorded.Recording) for x in given + more):
+        return given, more
+    where = [os.path.realpath(path) for path in given]
+    for path in more:
+        if os.path.realpath(path) in where:
+            raise recorded.RecordingError(f"{path}: given both for fitting and as held out; give it once")
+    train, held = recorded.load(given, model), recorded.load(more, model) if more else []
+    taken = {recording.name for recording in train}
+    return train, [dataclasses.replace(r, name=f"held out {r.name}") if r.name in taken else r for r in held]
+
+
+def _runs(model, recordings):
+    """Run the nominal model for 0.3 s from states of the recordings; notes on where it fails. Raises ModelError where it
+    fails in most."""
+    data = mujoco.MjData(model)
+    failed, tried, example = 0, 0, ""
+    for recording in recordings[:10]:
+        for row in np.linspace(0, len(recording.time) - 1, 6).astype(int)[:-1]:
+            mujoco.mj_resetData(model, data)
+            for known, target in ((recording.qpos[row], data.qpos), (recording.qvel[row], data.qvel)):
+                target[:] = np.where(np.isnan(known), target, known)
+            end = data.time + 0.3
+            while data.time < end:
+                now = min(np.searchsorted(recording.time, recording.time[row] + data.time, side="right") - 1, len(recording.time) - 1)
+                data.ctrl[:] = recording.ctrl[now]
+                mujoco.mj_step(model, data)
+                bad = [name for name in ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+                       if data.warning[getattr(mujoco.mjtWarning, name)].number]
+                if bad:
+                    failed += 1
+                    example = example or f"from {recording.name} at {recording.time[row]:.4g} s"
+                    break
+            tried += 1
+    if failed > tried / 2:
+        raise ModelError(f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first {example}); reduce its time "
+                         "step, or check its masses and gains, and the units of the recordings")
+    return [f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first {example})"] if failed else []
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        raise ModelError(f"{message}; see --help")
+
+
+def main(argv=None):
+    """The command. Returns the exit status: 0, or 2 with one line on stderr."""
+    parser = _Parser(prog="diagnose.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    nominal = parser.add_mutually_exclusive_group(required=True)
+    nominal.add_argument("--model", help="MJCF file of the nominal simulator")
+    nominal.add_argument("--env", help="gymnasium id of a MuJoCo environment, instead of --model")
+    parser.add_argument("--recordings", nargs="+", required=True, metavar="FILE", help="CSV, NPZ or Minari recordings to fit")
+    parser.add_argument("--held-out", nargs="+", metavar="FILE", help="recordings that are only predicted, never fitted")
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the report is written")
+    bar = None
+
+    def progress(fraction, what):
+        bar.set_description(what, refresh=False)
+        bar.update(max(0, min(1, fraction) - bar.n))
+
+    mujoco.set_mju_user_warning(lambda message: None)  # else MuJoCo leaves a MUJOCO_LOG.TXT in the working folder
+    try:
+        args = parser.parse_args(argv)
+        if args.model is not None and not os.path.isfile(args.model):
+            raise ModelError(f"{args.model}: no such model file; check the path")
+        report.check_folder(args.out)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # gymnasium on old versions of environments
+            if sys.stderr.isatty():
+                bar = tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", file=sys.stderr)
+            diagnosis = diagnose(args.model or args.env, args.recordings, args.held_out, progress if bar is not None else None)
+        report.write(diagnosis, args.out)
+    except (recorded.RecordingError, ModelError, report.ReportError, mujoco.FatalError, MemoryError) as error:
+        if bar is not None:
+            bar.close()
+        print(f"diagnose.py: {error}" if str(error) else "diagnose.py: out of memory; give fewer or shorter recordings", file=sys.stderr)
+        return 2
+    if bar is not None:
+        bar.close()
+    print(wording.terminal(diagnosis.summary, args.out.rstrip("/")))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,262 @@
+"""The three files of a diagnosis: diagnosis.json to compute with, corrected.xml to simulate with, report.html to look at.
+
+The page is one file: drawings are inline SVG, nothing is fetched, and it reads on a phone, in light and in dark.
+"""
+import html
+import json
+import math
+import os
+import tempfile
+
+import numpy as np
+
+import drawing
+import motion
+import wording
+from figures import Series, binned, chart, whisker
+from page import SCRIPT, STYLE
+
+E = html.escape
+
+
+class ReportError(ValueError):
+    """The report cannot be written. One line: where, why, and what to do."""
+
+
+def check_folder(out):
+    """Raises ReportError where a folder `out` cannot be written, before any computing is done."""
+    here = os.path.abspath(out)
+    while not os.path.lexists(here):
+        here = os.path.dirname(here)
+    if not os.path.isdir(here):
+        raise ReportError(f"{out}: {'is' if here == os.path.abspath(out) else here + ' is'} a file, not a folder; give another --out")
+    if not os.access(here, os.W_OK | os.X_OK):
+        raise ReportError(f"{out}: cannot be written; give another --out or change the permissions of {here}")
+
+
+def write(diagnosis, out):
+    """Write diagnosis.json, corrected.xml, report.html (and unknown_<n>.csv for unknown forces) into folder `out`.
+
+    All are complete under temporary names before the first takes its own. Raises ReportError where that fails; what was
+    in the folder before is then unchanged.
+    """
+    files = {"diagnosis.json": json.dumps(plain(diagnosis.summary), indent=2, allow_nan=False, ensure_ascii=False) + "\n",
+             "corrected.xml": diagnosis.corrected_xml, "report.html": html_page(diagnosis)}
+    for n, curve in enumerate(diagnosis.unknown_curves, start=1):
+        rows = zip(np.asarray(curve["x"], float).tolist(), np.asarray(curve["force"], float).tolist())
+        files[f"unknown_{n}.csv"] = f"{curve['variable']},force\n" + "".join(f"{x:.9g},{force:.9g}\n" for x, force in rows)
+    made = not os.path.isdir(out)
+    waiting = {}
+    try:
+        os.makedirs(out, exist_ok=True)
+        for name, text in files.items():
+            handle, waiting[name] = tempfile.mkstemp(prefix=f".{name}.", dir=out)
+            with os.fdopen(handle, "w", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.chmod(waiting[name], 0o666 & ~_umask())
+        for name in files:
+            os.replace(waiting[name], os.path.join(out, name))
+    except OSError as error:
+        for path in waiting.values():
+            if os.path.exists(path):
+                os.remove(path)
+        if made and os.path.isdir(out) and not os.listdir(out):
+            os.rmdir(out)
+        raise ReportError(f"{out}: the report cannot be written ({error.strerror or error}); free some space or give another --out") from None
+
+
+def _umask():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def plain(value):
+    """Strict JSON: numpy to Python, and null for what is not a finite number."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+# --- the page -------------------------------------------------------------------------------------------------------
+
+def html_page(diagnosis):
+    """The whole page as a string."""
+    summary, model = diagnosis.summary, diagnosis.world.model
+    title = f"Diagnosis: {wording.model_title(model)}"
+    body = "".join([_head(summary, title), _mechanism(diagnosis), _findings(diagnosis), _prediction(diagnosis), _traces(diagnosis),
+                    _unexplained(diagnosis), _ranking(diagnosis), _advice(diagnosis), _about(diagnosis)])
+    return (f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+            f'<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,"><title>{E(title)}</title>'
+            f"<style>{STYLE}</style></head><body><main>{body}</main><script>{SCRIPT}</script></body></html>\n")
+
+
+def _section(title, *parts, note=""):
+    body = "".join(parts)
+    return f"<section><h2>{E(title)}</h2>{f'<p class=note>{E(note)}</p>' if note else ''}{body}</section>" if body else ""
+
+
+def _box(svg, wide=False):
+    return f'<div class="{"scroll wide" if wide else "scroll"}">{svg}</div>' if svg else ""
+
+
+def _legend(*looks):
+    return '<p class="legend">' + "".join(f'<span><i class="{look}"></i>{E(words)}</span>' for look, words in looks) + "</p>"
+
+
+def _head(summary, title):
+    findings = "".join(f"<li>{E(wording.finding_words(finding))}</li>" for finding in summary["findings"])
+    fit = summary["fit"]["held_out"]
+    steps = "".join(f'<div class="{look}"><b>{E(wording.number(fit[key], 2))}</b><span>{words}</span></div>'
+                    for key, look, words in (("before", "nominal", "nominal model"), ("after", "corrected", "corrected model"),
+                                             ("floor", "noise", "sensors’ noise")) if fit.get(key) is not None)
+    left = wording.unexplained_words(summary)
+    return (f'<header><p class="kicker">{E(title)}</p><h1 class="{summary["verdict"]}">{E(wording.verdict_words(summary))}</h1>'
+            f'{f"<ol class=verdict>{findings}</ol>" if findings else ""}'
+            f'<p>{E(wording.sentence(wording.error_words(summary)))}{" " + E(wording.sentence(left)) if left else ""}</p>'
+            f'<div class="steps">{steps}</div><p class="note">Error on recordings held out, {fit.get("horizon_s", 0.3):g} s ahead, '
+            "in multiples of each channel’s noise.</p></header>")
+
+
+def _mechanism(diagnosis):
+    summary, model = diagnosis.summary, diagnosis.world.model
+    labels = [wording.effect_words(f["effect"]) + (f" ({f['place']['name']})" if f["place"]["kind"] != "world" else "") for f in summary["findings"]]
+    poses = motion.poses(model, diagnosis.held_out)
+    picture = drawing.mechanism(model, poses, [f["place"] for f in summary["findings"]], labels)
+    moving = motion.overlay(diagnosis)
+    film = ""
+    if moving:
+        recording, start, seconds, motions = moving
+        film = (drawing.animation(model, motions, seconds)
+                + f'<p class="note">{E(recording)} from {wording.number(start)} s: both models start from the recorded state and are driven by the '
+                f"recorded control for {wording.number(seconds, 2)} s. Of the held-out stretches, the one where the nominal model errs most.</p>"
+                + _legend(("measured", "recorded"), ("nominal", "nominal"), ("corrected", "corrected")))
+    return _section("The mechanism", f'<div class="pair"><div>{_box(picture)}</div>{f"<div>{film}</div>" if film else ""}</div>')
+
+
+def _findings(diagnosis):
+    cards = []
+    for i, finding in enumerate(diagnosis.summary["findings"]):
+        rows = "".join(f"<tr><td>{E(p['name'])}</td><td>{E(wording.estimate(p))}</td><td>{E(wording.number(p['nominal']))}</td>"
+                       f"<td>{whisker(p)}</td></tr>" for p in finding["parameters"])
+        table = (f'<div class="scroll"><table><thead><tr><th>parameter</th><th>value, 95 %</th><th>nominal</th><th></th></tr></thead>'
+                 f"<tbody>{rows}</tbody></table></div>") if rows else ""
+        plots = "".join(_residual(r) for r in diagnosis.residuals if r["finding"] == i)
+        curves = "".join(_box(chart([Series(c["x"], c["force"], "corrected")], wording.axis_words(c["variable"]), f"force ({c['unit']})",
+                                    label="the unknown force")) for c in diagnosis.unknown_curves if c["finding"] == i)
+        evidence = finding.get("evidence") or {}
+        facts = []
+        if evidence.get("held_out_error_removed") is not None:
+            facts.append(f"removes {100 * evidence['held_out_error_removed']:.0f} % of the held-out error")
+        if evidence.get("p_value") is not None:
+            facts.append(f"p {wording.p_value(evidence['p_value'])}")
+        facts += [f"{key.replace('_', ' ')} {wording.number(value)}" for key, value in evidence.items()
+                  if key not in ("held_out_error_removed", "p_value") and isinstance(value, (int, float)) and not isinstance(value, bool)]
+        facts.append({"mjcf": "held in corrected.xml", "measurement": "a property of the measurement, so not in corrected.xml",
+                      "none": "has no plain MJCF form, so not in corrected.xml"}[finding["written_as"]])
+        others = "".join(f"<li>{E(wording.finding_words(other))}</li>" for other in finding.get("also_possible") or [])
+        others = f'<p class="or">These recordings cannot tell it from:</p><ul>{others}</ul>' if others else ""
+        cards.append(f'<article class="card"><h3>{i + 1}. {E(wording.finding_words(finding))}</h3><p class="facts">{E("; ".join(facts))}</p>'
+                     f'{table}<div class="pair">{plots}{curves}</div>{others}</article>')
+    return _section("What is wrong, in order of importance", *cards)
+
+
+def _residual(residual):
+    """Residual force against the variable that it depends on, before and after, with the bins' medians."""
+    x, before, after = (np.asarray(residual[key], float) for key in ("x", "before", "after"))
+    unit = residual["unit"]
+    picture = chart([Series(x, before, "nominal faint", "dots"), Series(x, after, "corrected faint", "dots"),
+                     Series(*binned(x, before), "nominal"), Series(*binned(x, after), "corrected")],
+                    wording.axis_words(residual["variable"], residual.get("x_unit")), f"residual ({unit})", label="residual against " + residual["variable"])
+    legend = _legend(("nominal", "left over by the nominal model"), ("corrected", "by the corrected one"))
+    return f"<div>{legend}{_box(picture)}</div>" if picture else ""
+
+
+def _prediction(diagnosis):
+    fit = diagnosis.summary["fit"]["held_out"]
+    curve = fit.get("curve") or []
+    picture = ""
+    if curve:
+        x, before, after, floor = (np.array([np.nan if point.get(key) is None else point[key] for point in curve], dtype=float)
+                                   for key in ("seconds", "before", "after", "floor"))
+        spread = np.nanmax(before) > 8 * max(np.nanmin(after), 1e-12)
+        picture = (_legend(("nominal", "nominal"), ("corrected", "corrected"), ("noise", "noise floor"))
+                   + _box(chart([Series(x, before, "nominal"), Series(x, after, "corrected"), Series(x, floor, "noise")], "horizon (s)",
+                                "error (× noise)", log_y=bool(spread), zero=not spread, label="error against horizon")))
+    rows = []
+    for name, c in (fit.get("channels") or {}).items():
+        unit, factor = wording.SMALL.get(c["unit"], (c["unit"], 1))
+        cells = "".join(f"<td>{'–' if c[key] is None else wording.number(c[key] * factor, 2)}</td>" for key in ("before", "after", "floor"))
+        rows.append(f"<tr><td>{E(name)}</td>{cells}<td>{E(unit)}</td></tr>")
+    table = (f'<div class="scroll"><table class="numbers"><thead><tr><th>channel</th><th>nominal</th><th>corrected</th><th>noise</th><th></th></tr></thead>'
+             f"<tbody>{''.join(rows)}</tbody></table></div>") if rows else ""
+    return _section("How well it predicts recordings it was not fitted to", f'<div class="pair"><div>{picture}</div><div>{table}</div></div>')
+
+
+def _traces(diagnosis):
+    """Held-out traces: every channel once, from the longest recording that has it; then more, folded away."""
+    order = sorted(range(len(diagnosis.traces)), key=lambda i: -len(diagnosis.traces[i]["time"]))
+    first = {}
+    for i in order:
+        first.setdefault(diagnosis.traces[i]["channel"], i)
+    shown = sorted(first.values())[:8]
+    more = [i for i in range(len(diagnosis.traces)) if i not in shown][:8]
+
+    def draw(i):
+        trace = diagnosis.traces[i]
+        time = np.asarray(trace["time"], float)
+        lines = [Series(time, np.asarray(trace[look], float), look) for look in ("nominal", "corrected", "measured")]
+        return (f'<h3 class="trace">{E(trace["channel"])} <small>{E(trace["recording"])}</small></h3>'
+                + _box(chart(lines, "time (s)", trace["channel"].split(":", 1)[-1], 900, 240, label=f"{trace['channel']} over time"), wide=True))
+
+    legend = _legend(("measured", "recorded"), ("nominal", "nominal"), ("corrected", "corrected"))
+    folded = f"<details><summary>{len(more)} more</summary>{''.join(map(draw, more))}</details>" if more else ""
+    return _section("Recorded and predicted, held out", legend if shown else "", *map(draw, shown), folded,
+                    note="Each prediction starts again from the recording after every horizon.")
+
+
+def _unexplained(diagnosis):
+    left = wording.unexplained_words(diagnosis.summary)
+    return _section("What is left", f"<p>{E(wording.sentence(left))}</p>") if left else ""
+
+
+def _ranking(diagnosis):
+    rows = []
+    chosen = {(f["effect"], f["place"]["kind"], f["place"]["name"]) for f in diagnosis.summary["findings"]}
+    for candidate in diagnosis.ranking[:15]:
+        place, removed = candidate["place"], candidate["error_removed"]
+        share = 0 if removed is None or not math.isfinite(removed) else min(1, max(0, removed))
+        found = (candidate["effect"], place["kind"], place["name"]) in chosen
+        rows.append(f'<tr{" class=chosen" if found else ""}><td>{E(wording.effect_words(candidate["effect"]))}</td><td>{E(wording.place_words(place))}</td>'
+                    f'<td><span class="bar"><i style="width:{100 * share:.0f}%"></i></span> {100 * share:.0f} %</td>'
+                    f'<td>{E(wording.p_value(candidate["p_value"]))}</td></tr>')
+    if not rows:
+        return ""
+    return _section("Candidates", f'<div class="scroll"><table><thead><tr><th>effect</th><th>place</th><th>error it removes alone</th><th>p</th></tr></thead>'
+                    f"<tbody>{''.join(rows)}</tbody></table></div>",
+                    note="Each effect at each place, on its own, against the nominal model. Marked: in the diagnosis.")
+
+
+def _advice(diagnosis):
+    items = "".join(f"<li>{E(line)}</li>" for line in diagnosis.advice)
+    return _section("What cannot be told apart, and the experiment that would", f"<ul>{items}</ul>") if items else ""
+
+
+def _about(diagnosis):
+    summary = diagnosis.summary
+    notes = "".join(f"<li>{E(note)}</li>" for note in summary.get("warnings", []))
+    noise = ", ".join(f"{name} {wording.number(value, 2)}" for name, value in summary["noise"].items())
+    train, held = (", ".join(dict.fromkeys(r.name for r in part)) for part in (diagnosis.train, diagnosis.held_out))
+    return _section("The recordings", f"<p>Fitted: {E(train)}.<br>Held out: {E(held)}.<br>Noise (SI): {E(noise)}.</p>",
+                    f"<ul>{notes}</ul>" if notes else "",
+                    "<p class=note>Beside this page: diagnosis.json (all numbers) and corrected.xml (the corrected model, for stock MuJoCo).</p>")

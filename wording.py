@@ -1,0 +1,167 @@
+"""A diagnosis in plain words and honest digits, for the terminal and for the page.
+
+Everything here reads `Diagnosis.summary`, the dictionary that becomes diagnosis.json.
+"""
+import math
+
+SPOKEN = {"coulomb": "Coulomb", "stribeck": "Stribeck", "back_emf": "back-EMF", "center_of_mass": "centre of mass"}
+SMALL = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}  # errors and noise are small: in these they read better
+
+
+def effect_words(effect):
+    """"coulomb_friction" -> "Coulomb friction"."""
+    for name, spoken in SPOKEN.items():
+        effect = effect.replace(name, spoken)
+    return effect.replace("_", " ")
+
+
+def place_words(place):
+    """{"kind": "joint", "name": "elbow"} -> "joint elbow"."""
+    return "the world" if place["kind"] == "world" else f"{place['kind']} {place['name']}"
+
+
+def number(value, digits=3):
+    """A number to so many significant digits, without a needless exponent: 0.0005, 411, 1.2e-07."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}".replace("e-0", "e-").replace("e+0", "e")
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{decimals}f}"
+
+
+def estimate(parameter):
+    """A parameter with its 95 % interval, to the digits the interval warrants: "0.121 ± 0.004 N·m"."""
+    value, low, high, unit = (parameter.get(key) for key in ("value", "low", "high", "unit"))
+    unit = f" {unit}" if unit and unit != "1" else ""
+    if low is None or high is None or not high > low:
+        return number(value) + unit
+    half = (high - low) / 2
+    decimals = max(0, (half < 2.95 * 10.0 ** math.floor(math.log10(half))) - math.floor(math.log10(half)))  # 0.12 but 0.4
+    if decimals > 9 or half > 1e6:
+        return f"{number(value)} ({number(low)} to {number(high)}){unit}"
+    if abs(value - (low + high) / 2) < 0.25 * half:
+        return f"{value:.{decimals}f} ± {half:.{decimals}f}{unit}"
+    return f"{value:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f}){unit}"
+
+
+def finding_words(finding):
+    """One finding in a sentence: "joint elbow: Coulomb friction 0.121 ± 0.004 N·m was left out"."""
+    place, effect = place_words(finding["place"]), effect_words(finding["effect"])
+    if finding["effect"] == "unknown":
+        on = depends_words(finding.get("depends_on"))
+        return f"{place}: a force that the catalogue has no name for{f', depending on {on}' if on else ''}"
+    parameters = finding["parameters"]
+    if not parameters:
+        return f"{place}: {effect}"
+    if all(parameter["nominal"] in (0, None) for parameter in parameters):
+        values = ", ".join((f"{p['name']} " if len(parameters) > 1 else "") + estimate(p) for p in parameters)
+        sentence = f"{place}: {effect} {values} was left out"
+    else:
+        values = ", ".join((f"{p['name']} " if len(parameters) > 1 or p["name"] not in effect else "") + change(p) for p in parameters)
+        sentence = f"{place}: {effect}{':' if values[0].isalpha() else ''} {values}"
+    return sentence + when_words(finding.get("when"))
+
+
+def change(parameter):
+    """"4.52 ± 0.03 kg instead of 3.56 (+27 %)"."""
+    nominal = parameter["nominal"]
+    if nominal is None:
+        return estimate(parameter)
+    share = f" ({100 * (parameter['value'] / nominal - 1):+.0f} %)" if nominal else ""
+    return f"{estimate(parameter)} instead of {number(nominal)}{share}"
+
+
+def when_words(when):
+    """The `when` of a finding as the end of a sentence."""
+    if not when:
+        return ""
+    if "time" in when:
+        return f", in {when['recording']} from {number(when['time'][0])} to {number(when['time'][1])} s"
+    return ", where " + " and ".join(f"{name} is between {number(a)} and {number(b)}" for name, (a, b) in when.items())
+
+
+def depends_words(depends_on):
+    """["velocity:elbow", "time"] -> "the velocity of elbow and time"."""
+    words = []
+    for item in depends_on or []:
+        kind, _, name = item.partition(":")
+        words.append(f"{kind} with {name}" if kind == "contact" else f"the {kind} of {name}" if name else kind)
+    return " and ".join(words)
+
+
+def error_words(summary):
+    """"held-out error falls from 31 to 2 mrad at elbow; the sensors' noise is 1 mrad" (0.3 s ahead)."""
+    fit = summary["fit"]["held_out"]
+    ahead = f"{fit.get('horizon_s', 0.3):g} s ahead"
+    channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"] and c["before"] is not None}
+    if channels:
+        # the channel in which the two models differ most, counted in noise
+        name = max(channels, key=lambda n: abs(channels[n]["before"] - channels[n]["after"]) / channels[n]["floor"])
+        before, after, floor, unit = (channels[name][key] for key in ("before", "after", "floor", "unit"))
+        unit, factor = SMALL.get(unit, (unit, 1))
+        before, after, floor = (f"{number(x * factor, 2)}" for x in (before, after, floor))
+        place = " at " + name.split(":", 1)[1]
+    else:
+        before, after, floor, unit, place = *(number(fit[key], 2) for key in ("before", "after", "floor")), "times the noise", ""
+    if summary["verdict"] == "match":
+        return f"held-out error {ahead} is {before} {unit}{place}; the sensors' noise is {floor} {unit}"
+    return f"held-out error {ahead} falls from {before} to {after} {unit}{place}; the sensors' noise is {floor} {unit}"
+
+
+def unexplained_words(summary):
+    """What is left over, in a sentence, or "" where nothing worth saying is."""
+    left = summary.get("unexplained") or {}
+    if not left.get("fraction") or left["fraction"] < 0.02:
+        return ""
+    at = f" at {place_words(left['place'])}" if left.get("place") else ""
+    on = depends_words(left.get("depends_on"))
+    return f"{100 * left['fraction']:.0f} % of the original error stays unexplained{at}{f', depending on {on}' if on else ''}"
+
+
+def verdict_words(summary):
+    """The first line of everything."""
+    if summary["verdict"] == "match":
+        return "Nothing is missing: no effect of the catalogue improves the prediction of recordings held out."
+    count = len(summary["findings"])
+    return "One thing is wrong with the simulator." if count == 1 else f"{count} things are wrong with the simulator."
+
+
+def terminal(summary, out):
+    """The summary for the terminal, several lines."""
+    lines = [verdict_words(summary)]
+    for finding in summary["findings"]:
+        lines.append(f"  {finding_words(finding)}")
+        for other in finding.get("also_possible") or []:
+            lines.append(f"    or, as far as these recordings tell: {finding_words(other)}")
+    lines.append(sentence(error_words(summary)))
+    left = unexplained_words(summary)
+    lines += [sentence(left)] if left else []
+    lines += [f"Note: {warning}" for warning in summary.get("warnings", [])[:8]]
+    lines.append(f"Written: {out}/report.html, diagnosis.json, corrected.xml")
+    return "\n".join(lines)
+
+
+def sentence(words):
+    """With a capital and a full stop."""
+    return words[:1].upper() + words[1:] + "."
+
+
+def p_value(p):
+    """"< 1e-16", "0.03"."""
+    if p is None or not math.isfinite(p):
+        return "–"
+    return "< 1e-16" if p < 1e-16 else number(p, 2)
+
+
+def axis_words(variable, unit=None):
+    """"velocity:elbow" -> "velocity of elbow (rad/s)"."""
+    kind, _, name = variable.partition(":")
+    return (f"{kind} of {name}" if name else kind) + (f" ({unit})" if unit else " (s)" if variable == "time" else "")
+
+
+def model_title(model):
+    """The model's own name: the first of MuJoCo's NUL-separated names."""
+    return bytes(model.names).split(b"\0", 1)[0].decode(errors="replace") or "the mechanism"
