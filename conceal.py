@@ -103,6 +103,9 @@ def draw(seed, number, rng):
     finer = int(rng.choice((1, 4)))
     scale = _scale(MECHANISMS[mechanism], model, rng)
     hidden = [_item(effect, place, size, model, scale, rng) for effect, place, size in wanted]
+    if kind == "pair":
+        for item in hidden:
+            item["parameters"].pop("event", None)
     if any(item["effect"] == "time_step" for item in hidden):
         finer = 4
     if any(item["effect"] == "backlash" for item in hidden):
@@ -231,7 +234,7 @@ def _item(effect, name, size, model, scale, rng):
         p = {"drag": 2 * size * torque / speed ** 3}
     else:                                            # fading_gain
         actuator = int(np.flatnonzero(model.actuator_trnid[:, 0] == joint.id)[0])
-        return _place(effect, "joint", name, loss=size, seconds=unit(1.0, 3.0), actuator=model.actuator(actuator).name)
+        return _place(effect, "joint", name, loss=size, seconds=unit(1.0, 3.0), actuator=actuator)
     return _place(effect, "joint", name, **{key: float(value) for key, value in p.items()})
 
 
@@ -240,12 +243,14 @@ def _place(effect, kind, name, **parameters):
 
 
 def _world(effect, size, sign, model, rng):
+    flat = not any(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) and not np.abs(
+        model.jnt_axis[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE][:, [0, 2]]).any()
+    turn = np.pi * rng.integers(2) if flat else rng.uniform(0, 2 * np.pi)     # flat: moves in x and z only
     if effect == "gravity":                          # tilted by up to 9 degrees
-        turn, tilt = rng.uniform(0, 2 * np.pi), 0.5 * size
+        tilt = 0.5 * size
         g = 9.81 * np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
         return _place(effect, "world", "world", **dict(zip("xyz", g.tolist())))
     if effect == "wind":
-        turn = rng.uniform(0, 2 * np.pi)
         return _place(effect, "world", "world", x=10 * size * float(np.cos(turn)), y=10 * size * float(np.sin(turn)), z=0.0)
     if effect == "air_drag":
         return _place(effect, "world", "world", density=float(model.opt.density * (1 + 8 * size)))
@@ -256,7 +261,6 @@ def _body(effect, name, size, sign, model, scale, rng):
     body = model.body(name)
     mass, inertia = float(body.mass[0]), np.array(body.inertia)
     length = float(np.linalg.norm(body.ipos)) or float(max(model.geom_rbound[body.geomadr[0]], 0.05))
-    plane = {"x": 0, "z": 2} if name != "base" else {"x": 0, "y": 1}
     if effect == "mass":
         return _place(effect, "body", name, mass=mass * (1 + (sign if size < 0.2 else 1.0) * 1.5 * size))
     if effect == "inertia":
@@ -264,8 +268,7 @@ def _body(effect, name, size, sign, model, scale, rng):
     if effect == "center_of_mass":
         ipos = np.array(body.ipos)
         angle = rng.uniform(0, 2 * np.pi)
-        for axis, part in zip(plane.values(), (np.cos(angle), np.sin(angle))):
-            ipos[axis] += size * length * part
+        ipos[[0, 2]] += size * length * np.array([np.cos(angle), np.sin(angle)])
         return _place(effect, "body", name, **dict(zip("xyz", ipos.tolist())))
     if effect == "link_length":
         return _place(effect, "body", name, length=float(np.linalg.norm(body.pos)) * (1 + sign * 0.5 * size))

@@ -10,7 +10,6 @@ continuous control, averaged over a step; drag is summed over faces. Inertial pa
 and contact constants have no force of their own and are set in the model.
 """
 
-import copy
 from collections import deque
 
 import mujoco
@@ -38,8 +37,9 @@ class Real:
         self.data = mujoco.MjData(model)
         self.dt = model.opt.timestep
         self.stage = 0.5 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 1.0
-        self.rubbing = [self._dof(item) for item in hidden if item["effect"] in RUBS]
-        self.rubs = [item for item in hidden if item["effect"] in RUBS]
+        self.rubs = [item for item in hidden if item["effect"] in RUBS
+                     and (item["effect"] != "contact_friction" or self._slides(item))]
+        self.rubbing = [self._dof(item) for item in self.rubs]
         self.forced = [item for item in hidden if item["effect"] in FORCES]
         self.actuated = [item for item in hidden if item["effect"] in ACTUATORS]
         self.reset(model.qpos0, np.zeros(model.nv))
@@ -55,6 +55,8 @@ class Real:
         return self._joint(item).dofadr[0]
 
     def _actuator(self, item):
+        if item["effect"] == "fading_gain":
+            return item["parameters"]["actuator"]
         name = item["place"]["name"]
         return int(name) if name.isdigit() else self.model.actuator(name).id
 
@@ -106,8 +108,9 @@ class Real:
     def reset(self, qpos, qvel):
         """Start anew at rest in everything hidden: bristles, delay lines, gaps."""
         mujoco.mj_resetData(self.model, self.data)
+        late = [item["parameters"]["seconds"] for item in self.hidden if item["effect"] == "sensor_delay"]
         self.memory = {"lines": {}, "lags": {}, "rub": np.zeros(len(self.rubs)),
-                       "acceleration": np.zeros(self.model.nv), "past": deque(maxlen=400)}
+                       "acceleration": np.zeros(self.model.nv), "past": deque(maxlen=2 + int(max(late, default=0) / self.dt))}
         self.put(qpos, qvel)
         mujoco.mj_forward(self.model, self.data)
 
@@ -124,11 +127,11 @@ class Real:
         """All of it, for `restore`."""
         state = np.empty(mujoco.mj_stateSize(self.model, FULL))
         mujoco.mj_getState(self.model, self.data, state, FULL)
-        return state, copy.deepcopy(self.memory)
+        return state, _copy(self.memory)
 
     def restore(self, state):
         mujoco.mj_setState(self.model, self.data, state[0], FULL)
-        self.memory = copy.deepcopy(state[1])
+        self.memory = _copy(state[1])
 
     def seen(self):
         """qpos (nq,) and qvel (nv,) at the sensors' place, without sensor faults or noise."""
@@ -388,6 +391,12 @@ FORCES = ("viscous_damping", "quadratic_damping", "stiffness", "nonlinear_stiffn
           "cogging", "joint_stop", "periodic_torque", "detent", "one_way_drag", "gravity",
           "external_force", "payload_change", "air_drag", "wind")
 ACTUATORS = ("gain", "bias", "delay", "lag", "saturation", "back_emf", "dead_zone", "fading_gain")
+
+
+def _copy(memory):
+    """A copy two levels deep, which is as deep as anything in it changes."""
+    return {key: value.copy() if hasattr(value, "copy") else value
+            for key, value in (memory | {"lines": {k: list(v) for k, v in memory["lines"].items()}}).items()}
 
 
 def _build(spec, item):

@@ -305,8 +305,9 @@ def _places(joints, driven, actuators, bodies, limbs=(), **more):
     """The usual places: every joint, the driven ones, the actuators, the bodies with mass."""
     places = {effect: joints for effect in JOINT_EFFECTS + SENSOR_EFFECTS}
     places |= {effect: actuators for effect in CONTROL_EFFECTS}
-    places |= {"cogging": driven, "joint_stop": driven, "mass": bodies, "center_of_mass": bodies,
-               "inertia": bodies, "external_force": bodies, "payload_change": bodies,
+    turning = tuple(body for body in bodies if body not in ("cart", "trolley", "block"))
+    places |= {"cogging": driven, "joint_stop": driven, "mass": bodies, "center_of_mass": turning,
+               "inertia": turning, "external_force": bodies, "payload_change": bodies,
                "link_length": limbs, "gravity": ("world",), "time_step": ("world",)}
     places |= {unknown: joints for unknown in UNKNOWNS}
     places["fading_gain"] = driven

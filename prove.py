@@ -1,0 +1,324 @@
+"""Sealed blind trials of the diagnosis: hide an effect, diagnose as a user would, reveal, score.
+
+    python prove.py run --seed 1 --trials 40 --out results/proof_dev.csv
+    python prove.py show --seed 1 --trial 15 --folder /tmp/t15       # draw a development trial again
+    python prove.py page results/proof.csv --out results/proof.html
+
+A trial is concealed here (conceal.py); SHA-256 of answer and salt goes to OUT.sealed; then
+diagnose.py runs in its own process with nothing but the folder of nominal model and recordings;
+then the answer is revealed, the seal checked, and the row of OUT written. Trials already in OUT are
+not run again.
+
+Scored as the contract counts: a finding is right when it is named or stands in also_possible;
+time_step is no false alarm beside a right finding, nor where the truth was integrated finer.
+"""
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor, as_completed
+import csv
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
+
+import mujoco
+import numpy as np
+from tqdm import tqdm
+
+from conceal import DEPENDS_ON, FINAL_SEED, conceal, seal
+from hidden import Real
+from mechanisms import MECHANISMS, UNKNOWNS
+
+ROOT = Path(__file__).resolve().parent
+HORIZON = 0.3                                        # s
+COLUMNS = ("seed", "trial", "commitment", "salt", "answer", "kind", "mechanism", "noise", "finer",
+           "over_noise", "exit", "seconds", "verdict", "findings", "found", "first", "extras",
+           "parameters", "error_before", "error_after", "error_floor", "reported_before",
+           "reported_after", "note")
+PARAMETERS = {"mass": ("mass",), "center_of_mass": ("x", "y", "z"), "inertia": ("ixx", "iyy", "izz"),
+              "stribeck_friction": ("coulomb", "static", "velocity"), "joint_stop": ("low", "high"),
+              "cogging": ("amplitude", "poles", "phase"), "backlash": ("gap",), "gravity": ("x", "y", "z"),
+              "wind": ("x", "y", "z"), "external_force": ("x", "y", "z")}   # others have one
+VECTORS = ("center_of_mass", "inertia", "gravity", "wind", "external_force")
+
+
+# the contract's error, measured without any code of the diagnosis
+
+def windows(time, horizon=HORIZON):
+    """[(first row, last row)] of consecutive windows; one ends where the next begins; a stump is dropped."""
+    found, first = [], 0
+    while True:
+        last = int(np.searchsorted(time, time[first] + horizon * (1 + 1e-9), side="right")) - 1
+        if last <= first or last == len(time) - 1 and time[last] < time[first] + 0.9 * horizon:
+            return found
+        found.append((first, last))
+        first = last
+
+
+def velocity(model, run, row):
+    """qvel (nv,) at a row: as measured, else the central difference of the measured positions."""
+    if np.isfinite(run.qvel[row]).all():
+        return run.qvel[row]
+    before, after = max(row - 1, 0), min(row + 1, len(run.time) - 1)
+    qvel = np.empty(model.nv)
+    mujoco.mj_differentiatePos(model, qvel, run.time[after] - run.time[before], run.qpos[before], run.qpos[after])
+    return qvel
+
+
+def apart(model, qpos, other):
+    """other - qpos in the tangent space (nv,): rad and m."""
+    out = np.empty(model.nv)
+    mujoco.mj_differentiatePos(model, out, 1.0, qpos, other)
+    return out
+
+
+def rms(differences):
+    """Root mean square; inf where a simulation blew up."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        value = float(np.sqrt(np.mean(np.square(differences))))
+    return value if np.isfinite(value) else float("inf")
+
+
+def stock_error(nominal, model, runs, noise):
+    """The contract's Error of a stock MuJoCo `model`, in units of `noise`, over Runs.
+
+    Joints are found by the names of the `nominal` model; what `model` appends runs on by itself.
+    """
+    if nominal.nq != model.nq:
+        joints = [model.joint(nominal.joint(j).name) for j in range(nominal.njnt)]
+        q = np.concatenate([np.arange(j.qposadr[0], j.qposadr[0] + len(nominal.joint(j.name).qpos0)) for j in joints])
+        v = np.concatenate([np.arange(j.dofadr[0], j.dofadr[0] + len(nominal.joint(j.name).damping)) for j in joints])
+    else:
+        q, v = np.arange(model.nq), np.arange(model.nv)
+    differences, step = [], model.opt.timestep
+    for run in runs:
+        data = mujoco.MjData(model)
+        starts = {first for first, _ in windows(run.time)}
+        end = max((last for _, last in windows(run.time)), default=0)
+        for row in range(end + 1):
+            if row:
+                differences.append(apart(nominal, run.qpos[row], data.qpos[q]))
+            if row in starts:
+                data.qpos[q], data.qvel[v] = run.qpos[row], velocity(nominal, run, row)
+            if row < end:
+                data.ctrl[:nominal.nu] = run.ctrl[row]
+                length = run.time[row + 1] - run.time[row]
+                steps = max(1, round(length / step))
+                model.opt.timestep = length / steps
+                mujoco.mj_step(model, data, steps)
+    model.opt.timestep = step
+    return rms(differences) / noise
+
+
+def hand_error(real, runs, noise, perfect):
+    """Error of the hand-written `real` system over Runs, in units of noise.
+
+    perfect: started from what ideal sensors read, against that: what its physics alone leaves.
+    Otherwise from the noisy start that the contract prescribes, with the true memory: the floor.
+    """
+    nominal, differences = real.model, []
+    for run in runs:
+        if perfect:
+            real.reset(run.true_qpos[0], run.true_qvel[0])
+        for first, last in windows(run.time):
+            if perfect:
+                real.put(run.true_qpos[first], run.true_qvel[first])
+            else:
+                real.restore(run.states[first])
+                qpos, qvel = real.seen()
+                mujoco.mj_integratePos(nominal, qpos, apart(nominal, run.true_qpos[first], run.qpos[first]), 1.0)
+                real.put(qpos, qvel + velocity(nominal, run, first) - run.true_qvel[first])
+            for row in range(first, last):
+                real.advance(run.ctrl[row], run.time[row + 1] - run.time[row], bool(run.event[row]))
+                goal = run.true_qpos if perfect else run.qpos
+                differences.append(apart(nominal, goal[row + 1], real.reading()[0]))
+    return rms(differences) / noise
+
+
+def over_noise(answer, runs, without):
+    """How far the hidden items `without` (indices) move the prediction of Runs, in units of noise."""
+    rest = [item for index, item in enumerate(answer["hidden"]) if index not in without]
+    coarse = any(answer["hidden"][index]["effect"] == "time_step" for index in without)
+    real = Real(MECHANISMS[answer["mechanism"]], rest, 1 if coarse else answer["finer"])
+    return hand_error(real, runs, answer["noise"], True)
+
+
+# the diagnosis, as a user would run it
+
+def diagnose(command, folder, limit=900):
+    """Run diagnose.py in `folder` with a bare environment. Returns exit status, seconds, stderr's last line."""
+    environment = {"PATH": os.defpath, "HOME": str(folder), "OMP_NUM_THREADS": "1"}
+    begun = time.monotonic()
+    try:
+        done = subprocess.run([sys.executable, str(ROOT / "diagnose.py"), *command, "--out", "report"], cwd=folder,
+                              env=environment, capture_output=True, text=True, timeout=limit, stdin=subprocess.DEVNULL)
+        status, note = done.returncode, (done.stderr.strip().splitlines() or [""])[-1]
+    except subprocess.TimeoutExpired:
+        status, note = 124, f"no diagnosis in {limit} s"
+    return status, time.monotonic() - begun, note[:300]
+
+
+# scoring
+
+def names(finding):
+    """Every (effect, place) that a finding holds possible, its own first."""
+    return [(f["effect"], f["place"]["kind"], f["place"]["name"]) for f in [finding, *finding.get("also_possible", [])]]
+
+
+def right(finding, item):
+    """Does a finding name the hidden item, as the contract counts it?"""
+    if item["effect"] not in UNKNOWNS:
+        return (item["effect"], item["place"]["kind"], item["place"]["name"]) in names(finding)
+    if ("unknown", "joint", item["place"]["name"]) not in names(finding):
+        return False
+    wanted = DEPENDS_ON[item["effect"]]
+    return any(variable.split(":")[0] in wanted for variable in finding.get("depends_on", []))
+
+
+def score(answer, findings):
+    """found, first, extras: hidden items named anywhere / by a finding's own name / findings of what is not there."""
+    hidden = answer["hidden"]
+    found = [any(right(f, item) for f in findings) for item in hidden]
+    first = [any(right(f | {"also_possible": []}, item) for f in findings) for item in hidden]
+    spare = lambda f: f["effect"] == "time_step" and (answer["finer"] > 1 or any(found))
+    extras = [f for f in findings if not any(right(f, item) for item in hidden) and not spare(f)]
+    return {"found": sum(found), "first": sum(first), "extras": len(extras)}
+
+
+def compare_parameters(answer, findings, runs):
+    """[{name, truth, value, low, high}] of each right first name; components that move nothing are left out."""
+    rows = []
+    for index, item in enumerate(answer["hidden"]):
+        finding = next((f for f in findings if right(f | {"also_possible": []}, item)), None)
+        if finding is None or item["effect"] in UNKNOWNS:
+            continue
+        reported = finding["parameters"]
+        wanted = PARAMETERS.get(item["effect"]) or list(item["parameters"])[:1]
+        for name in wanted:
+            match = reported if len(wanted) == 1 else [p for p in reported if p["name"] == name]
+            if not match or item["effect"] in VECTORS and _still(answer, index, name, match[0], runs):
+                continue
+            rows.append({"effect": item["effect"], "name": name, "truth": item["parameters"][name],
+                         **{key: match[0].get(key) for key in ("nominal", "value", "low", "high")}})
+    return rows
+
+
+def _still(answer, index, component, reported, runs):
+    """True where this component of a hidden vector moves predictions by less than the noise."""
+    item = answer["hidden"][index]
+    changed = item | {"parameters": item["parameters"] | {component: reported["nominal"] or 0.0}}
+    rest = [changed if k == index else other for k, other in enumerate(answer["hidden"])]
+    real = Real(MECHANISMS[answer["mechanism"]], rest, answer["finer"])
+    return hand_error(real, runs, answer["noise"], True) < 1.0
+
+
+def run_trial(seed, number, sealed):
+    """One sealed trial; appends its seal to the file `sealed`, returns the row of the table."""
+    with tempfile.TemporaryDirectory() as parent:
+        folder = Path(parent) / "bench"
+        folder.mkdir()
+        trial = conceal(seed, number, folder)
+        with open(sealed, "a") as file:
+            file.write(f"{seed} {number} {trial.commitment}\n")
+        status, seconds, note = diagnose(trial.command, folder)
+        return reveal(trial, folder / "report", seed, number, status, seconds, note)
+
+
+def reveal(trial, report, seed, number, status, seconds, note):
+    """Check the seal, score the report against the answer. Returns the row."""
+    if seal(trial.answer, trial.salt) != trial.commitment:
+        raise ValueError(f"trial {number} of seed {seed}: the answer is not the one that was sealed")
+    answer = json.loads(trial.answer)
+    held_out = [run for name, run in trial.runs.items() if name.startswith("held_out")]
+    events = [run for run in trial.runs.values() if run.event.any()]
+    nominal = MECHANISMS[answer["mechanism"]].spec().compile()
+    moved = [over_noise(answer, events if item["parameters"].get("event") else held_out, {index})
+             for index, item in enumerate(answer["hidden"])]
+    row = {"seed": seed, "trial": number, "commitment": trial.commitment, "salt": trial.salt,
+           "answer": trial.answer, "kind": answer["kind"], "mechanism": answer["mechanism"],
+           "noise": answer["noise"], "finer": answer["finer"], "over_noise": json.dumps([round(m, 4) for m in moved]),
+           "exit": status, "seconds": round(seconds, 2), "note": note,
+           "error_before": stock_error(nominal, nominal, held_out, answer["noise"]),
+           "error_floor": hand_error(Real(MECHANISMS[answer["mechanism"]], answer["hidden"], answer["finer"]),
+                                     held_out, answer["noise"], False)}
+    if status == 0:
+        summary = json.loads((report / "diagnosis.json").read_text())
+        findings = summary["findings"]
+        corrected = mujoco.MjModel.from_xml_path(str(report / "corrected.xml"))
+        fit = summary["fit"]["held_out"]
+        row |= {"verdict": summary["verdict"], "findings": json.dumps(findings), **score(answer, findings),
+                "parameters": json.dumps(compare_parameters(answer, findings, events or held_out)),
+                "error_after": stock_error(nominal, corrected, held_out, answer["noise"]),
+                "reported_before": fit["before"], "reported_after": fit["after"]}
+    return {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
+
+
+# the table
+
+def read(path):
+    """Rows of a table of trials, as dicts of text."""
+    csv.field_size_limit(10**8)
+    if not Path(path).exists():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write(path, rows):
+    """The whole table, sorted, at once."""
+    temporary = Path(f"{path}.new")
+    with open(temporary, "w", newline="") as file:
+        table = csv.DictWriter(file, COLUMNS)
+        table.writeheader()
+        table.writerows(sorted(rows, key=lambda row: (int(row["seed"]), int(row["trial"]))))
+    os.replace(temporary, path)
+
+
+def run(seed, numbers, out, jobs):
+    """Run the trials `numbers` of a seed that `out` does not hold yet."""
+    out = Path(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    rows = read(out)
+    done = {int(row["trial"]) for row in rows if int(row["seed"]) == seed}
+    wanted = [number for number in numbers if number not in done]
+    with ProcessPoolExecutor(jobs) as pool:
+        futures = [pool.submit(run_trial, seed, number, f"{out}.sealed") for number in wanted]
+        for future in tqdm(as_completed(futures), total=len(futures), disable=not sys.stderr.isatty()):
+            rows.append(future.result())
+            write(out, rows)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    command = commands.add_parser("run", help="run sealed trials and append them to a table")
+    command.add_argument("--seed", type=int, required=True, help=f"below 1000 to develop on; {FINAL_SEED} is the final one")
+    command.add_argument("--trials", type=int, default=400, help="trials 0 .. N-1")
+    command.add_argument("--first", type=int, default=0, help="start at this trial")
+    command.add_argument("--out", required=True, help="CSV; its seals go to OUT.sealed")
+    command.add_argument("--jobs", type=int, default=os.cpu_count(), help="trials at once (all cores)")
+    command = commands.add_parser("show", help="draw one trial again: its folder, command and answer")
+    command.add_argument("--seed", type=int, required=True)
+    command.add_argument("--trial", type=int, required=True)
+    command.add_argument("--folder", required=True, help="made, and filled")
+    command = commands.add_parser("page", help="make the page of figures from a table")
+    command.add_argument("table")
+    command.add_argument("--out", required=True)
+    arguments = parser.parse_args()
+    if arguments.command == "run":
+        run(arguments.seed, range(arguments.first, arguments.trials), arguments.out, arguments.jobs)
+    elif arguments.command == "show":
+        folder = Path(arguments.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        trial = conceal(arguments.seed, arguments.trial, folder)
+        print("python diagnose.py", *trial.command, "--out report\n" + trial.answer)
+    else:
+        import proof_page
+        proof_page.write(read(arguments.table), arguments.out)
+
+
+if __name__ == "__main__":
+    main()
