@@ -1,0 +1,225 @@
+"""Effects in an actuator: motors, position servos and velocity servos alike."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from effects import HUGE, JOINT_TRANSMISSION, Effect, Parameter, catalogue, turns
+
+
+class ActuatorEffect(Effect):
+    """An effect on an actuator with one control and an affine force: motors and servos."""
+    kinds = ('actuator',)
+
+    def fits(self, model, i):
+        affine = model.actuator_gaintype[i] in (0, 1) and model.actuator_biastype[i] in (0, 1)
+        return affine and model.actuator_ctrlnum[i] == 1 and model.actuator_outnum[i] == 1
+
+    @staticmethod
+    def strength(model, i):
+        """A typical force of the actuator."""
+        if model.actuator_forcelimited[i]:
+            return abs(model.actuator_forcerange[i]).max()
+        if model.actuator_ctrllimited[i]:
+            return abs(model.actuator_gainprm[i, 0]) * abs(model.actuator_ctrlrange[i]).max()
+        return abs(model.actuator_gainprm[i, 0])
+
+    @staticmethod
+    def forces(model, i, recordings):
+        """|force| that the recorded controls asked for, but for velocity feedback."""
+        asked = [model.actuator_gainprm[i, 0] * r.ctrl[:, model.actuator_ctrladr[i]] for r in recordings]
+        if model.actuator_biasprm[i, 1] and model.actuator_trntype[i] == JOINT_TRANSMISSION:
+            q = model.jnt_qposadr[model.actuator_trnid[i, 0]]
+            asked = [F + model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0] * r.qpos[:, q] for F, r in zip(asked, recordings)]
+        return abs(np.nan_to_num(np.concatenate(asked)))
+
+    @staticmethod
+    def unit(model, i):
+        """Unit of its force."""
+        return 'N·m' if model.actuator_trntype[i] == JOINT_TRANSMISSION and turns(model, model.actuator_trnid[i, 0]) else 'N'
+
+    @staticmethod
+    def general(spec, model, i):
+        """The spec's actuator, in a notation that can hold any gain and bias."""
+        actuator = spec.actuator(model.actuator(i).name)
+        actuator.type = mujoco.mjtActuator.mjACTUATOR_GENERAL
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        return actuator
+
+
+@catalogue
+class Gain(ActuatorEffect):
+    """The actuator is stronger or weaker by a ratio, feedback of a servo included."""
+    name, simplicity, related = 'gain', 0, ('mass', 'armature', 'viscous_damping', 'stiffness')
+
+    def parameters(self, model, i):
+        return Parameter('gain', '1', 1.0, 0.01, 100.0, 0.01),
+
+    def edit(self, model, i, values):
+        model.actuator_gainprm[i, :3] *= values[0]
+        model.actuator_biasprm[i, :3] *= values[0]
+
+    def write(self, spec, model, i, values):
+        actuator = self.general(spec, model, i)
+        actuator.gainprm[:3] *= values[0]
+        actuator.biasprm[:3] *= values[0]
+        return 'mjcf'
+
+
+@catalogue
+class Bias(ActuatorEffect):
+    """A constant actuator force on top."""
+    name, related = 'bias', ('spring_offset', 'gravity')
+
+    def parameters(self, model, i):
+        F = self.strength(model, i)
+        return Parameter('bias', self.unit(model, i), 0.0, -HUGE * F, HUGE * F, 0.01 * F),
+
+    def edit(self, model, i, values):
+        model.actuator_biasprm[i, 0] += values[0]
+
+    def write(self, spec, model, i, values):
+        self.general(spec, model, i).biasprm[0] += values[0]
+        return 'mjcf'
+
+
+@catalogue
+class BackEmf(ActuatorEffect):
+    """A force −d·(actuator velocity): back-EMF, or the velocity gain of a servo."""
+    name, related = 'back_emf', ('viscous_damping', 'gain', 'lag')
+
+    def parameters(self, model, i):
+        nominal, step = -model.actuator_biasprm[i, 2], 0.01 * self.strength(model, i)
+        if model.actuator_trntype[i] == JOINT_TRANSMISSION:
+            step = 0.02 * model.dof_M0[model.jnt_dofadr[model.actuator_trnid[i, 0]]] / model.actuator_gear[i, 0]**2
+        return Parameter('damping', 'N·m·s/rad' if self.unit(model, i) == 'N·m' else 'N·s/m', nominal, 0.0, HUGE * step, max(step, 0.01 * nominal)),
+
+    def edit(self, model, i, values):
+        model.actuator_biasprm[i, 2] = -values[0]
+
+    def write(self, spec, model, i, values):
+        self.general(spec, model, i).biasprm[2] = -values[0]
+        return 'mjcf'
+
+
+@catalogue
+class Saturation(ActuatorEffect):
+    """The force is cut off at ± forcerange."""
+    name, related = 'saturation', ('gain',)
+
+    def parameters(self, model, i):
+        F = self.strength(model, i)
+        return Parameter('forcerange', self.unit(model, i), F if model.actuator_forcelimited[i] else np.inf, 1e-4 * F, HUGE * F, 0.02 * F),
+
+    def probes(self, model, i, recordings):
+        used = self.forces(model, i, recordings).max()
+        return used * np.array([[0.9], [0.7], [0.5], [0.3]]) if used > 0 else np.zeros((0, 1))
+
+    def edit(self, model, i, values):
+        model.actuator_forcelimited[i] = True
+        model.actuator_forcerange[i] = -values[0], values[0]
+
+    def write(self, spec, model, i, values):
+        actuator = spec.actuator(model.actuator(i).name)
+        actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-values[0], values[0]]
+        return 'mjcf'
+
+
+@catalogue
+class Delay(ActuatorEffect):
+    """The command acts later, by any fraction of a time step."""
+    name, simplicity, related = 'delay', 0, ('lag', 'sensor_delay', 'time_step')
+
+    def parameters(self, model, i):
+        return Parameter('seconds', 's', _nominal_delay(model, i), 0.0, 1.0, 0.001),
+
+    def command(self, signal, model, i, values):
+        return replace(signal, delay=values[0])
+
+    def write(self, spec, model, i, values):
+        step, actuator = spec.option.timestep, spec.actuator(model.actuator(i).name)
+        if values[0] < step:  # MuJoCo rounds a shorter delay up to one step
+            spec.option.timestep = step = step / np.ceil(step / values[0])
+        actuator.delay, actuator.interp, actuator.nsample = values[0], 1, int(np.ceil(values[0] / step - 1e-9)) + 1
+        return 'mjcf'
+
+
+def _nominal_delay(model, i):
+    return max(model.actuator_delay[i], model.opt.timestep) if model.actuator_delay[i] > 0 else 0.0
+
+
+@catalogue
+class Lag(ActuatorEffect):
+    """The command passes a first-order filter."""
+    name, related = 'lag', ('delay', 'back_emf')
+
+    def fits(self, model, i):
+        return super().fits(model, i) and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
+
+    def parameters(self, model, i):
+        return Parameter('seconds', 's', 0.0, 0.0, 5.0, 0.001),
+
+    def command(self, signal, model, i, values):
+        return replace(signal, lag=values[0])
+
+    def write(self, spec, model, i, values):
+        actuator = self.general(spec, model, i)
+        actuator.dyntype, actuator.actdim = mujoco.mjtDyn.mjDYN_FILTEREXACT, 1
+        actuator.dynprm[0] = values[0]
+        actuator.actearly = model.opt.integrator != int(mujoco.mjtIntegrator.mjINT_RK4)
+        if not actuator.actearly and values[0] < spec.option.timestep:  # Runge-Kutta explodes on a faster filter
+            spec.option.timestep /= np.ceil(spec.option.timestep / values[0])
+        return 'mjcf'
+
+
+@catalogue
+class DeadZone(ActuatorEffect):
+    """Nothing happens below a threshold: of the control (motor) or of the force (servo)."""
+    name, simplicity, related = 'dead_zone', 2, ('coulomb_friction', 'gain')
+
+    def fits(self, model, i):
+        return super().fits(model, i) and (not self._servo(model, i) or model.actuator_trntype[i] == JOINT_TRANSMISSION)
+
+    @staticmethod
+    def _servo(model, i):
+        return model.actuator_biasprm[i, 1:3].any()
+
+    def parameters(self, model, i):
+        F = self.strength(model, i)
+        if self._servo(model, i):
+            return Parameter('half_width', self.unit(model, i), 0.0, 0.0, HUGE * F, 0.005 * F),
+        u = F / abs(model.actuator_gainprm[i, 0])
+        return Parameter('half_width', 'control', 0.0, 0.0, HUGE * u, 0.01 * u),
+
+    def probes(self, model, i, recordings):
+        used = np.quantile(self.forces(model, i, recordings), 0.9)
+        unit = 1.0 if self._servo(model, i) else abs(model.actuator_gainprm[i, 0])
+        return used / unit * np.array([[0.03], [0.1], [0.3]]) if used > 0 else np.zeros((0, 1))
+
+    def command(self, signal, model, i, values):
+        if self._servo(model, i):
+            return signal
+        return replace(signal, value=np.sign(signal.value) * np.maximum(abs(signal.value) - values[0], 0.0))
+
+    def force(self, models, i, values):
+        model = models[0]
+        if not self._servo(model, i):
+            return None
+        gain, bias = (np.array([getattr(m, f'actuator_{prm}')[i, :3] for m in models]) for prm in ('gainprm', 'biasprm'))
+        limit = np.array([m.actuator_forcerange[i] if m.actuator_forcelimited[i] else (-np.inf, np.inf) for m in models])
+        joint, u, gear = model.actuator_trnid[i, 0], model.actuator_ctrladr[i], model.actuator_gear[i, 0]
+        q, d = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+
+        def absorbed(qpos, qvel, ctrl, time):
+            length, velocity = gear * qpos[:, q], gear * qvel[:, d]
+            F = gain[:, 0] * ctrl[:, u] + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * velocity
+            out = np.zeros_like(qvel)
+            out[:, d] = -gear * np.clip(np.clip(F, limit[:, 0], limit[:, 1]), -values[:, 0], values[:, 0])
+            return out
+        return absorbed
+
+    def write(self, spec, model, i, values):
+        return 'none'
+
+

@@ -1,0 +1,182 @@
+"""What an effect is: a place, parameters, and the ways it can change a simulation.
+
+An effect acts in one or more ways, each a method of Effect that does nothing
+unless a class overrides it:
+
+    edit      fields of the compiled model         build    parts edit() sizes
+    command   the control on its way               push     a constant force
+    force     a force that depends on the state    measure  the sensor
+    write     the same in MJCF                     probes   values worth a try
+
+Values are absolute, in SI units, with the sign of the MJCF field. A new effect
+is one class with the decorator @catalogue and no other line.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+JOINT_TRANSMISSION = int(mujoco.mjtTrn.mjTRN_JOINT)
+HUGE = 1e6     # upper bound where physics gives none, in units of the effect's own scale
+EFFECTS = []   # the catalogue, one instance of each class; effects are applied in this order
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an effect sits: kind is joint, actuator, body, geom, sensor or world."""
+    kind: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    `step` is a small typical change, for sensitivities; values outside
+    [low, high] are not physical. nominal is infinite for a limit that the
+    nominal model does not have.
+    """
+    name: str
+    unit: str
+    nominal: float
+    low: float
+    high: float
+    step: float
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect at a place, perhaps only under a condition. Hashable; equal if these are.
+
+    when: None, or a dict {'time': [from, to]} in the recording's time, with 'recording':
+    name if it is true of one recording only, or {'qpos:<joint>': [low, high]}, {'qvel:…': …}.
+    """
+    effect: 'Effect'
+    place: Place
+    parameters: tuple
+    when: dict = None
+
+    def _key(self):
+        return self.effect, self.place, repr(self.when)
+
+    def __eq__(self, other):
+        return isinstance(other, Candidate) and self._key() == other._key()
+
+    def __hash__(self):
+        return hash((self.effect.name, self.place))
+
+    def __repr__(self):
+        return f'{self.effect.name}({self.place.name})' + (f' when {self.when}' if self.when else '')
+
+    @property
+    def nominal(self):
+        return tuple(p.nominal for p in self.parameters)
+
+
+class Effect:
+    """One kind of physics; an id is always that of the model it is passed with."""
+    name = ''
+    kinds = ()         # kinds of place; one instance for each, with the attribute `kind`
+    constants = False  # edit() changes something that mj_setConst derives constants from
+    timed = False      # differs from a simpler effect only under a condition
+    simplicity = 1     # 0 for the first things to think of, up to 3
+    related = ()       # names of effects at the same joint in whose wrong value this one may hide
+
+    def __repr__(self):
+        return self.name
+
+    def places(self, model):
+        """Names of the objects of model where this effect can sit."""
+        if self.kind == 'world':
+            return ['world'] if self.fits(model, 0) else []
+        count, view = {'body': (model.nbody, model.body), 'joint': (model.njnt, model.joint), 'geom': (model.ngeom, model.geom),
+                       'actuator': (model.nactuator, model.actuator), 'sensor': (model.nsensor, model.sensor)}[self.kind]
+        return [view(i).name for i in range(count) if self.fits(model, i)]
+
+    def id(self, model, name):
+        """Id of the object of that name in model."""
+        if self.kind == 'world':
+            return 0
+        return mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f'mjOBJ_{self.kind.upper()}'), name)
+
+    def fits(self, model, i):
+        """Whether the effect can sit at object i."""
+        return True
+
+    def parameters(self, model, i):
+        """Tuple of Parameter for object i."""
+        raise NotImplementedError
+
+    def probes(self, model, i, recordings):
+        """Values (P, parameters) to try first: by default each parameter a step up, and down where it may."""
+        parameters = self.parameters(model, i)
+        nominal = [p.nominal for p in parameters]
+        rows = [nominal[:k] + [p.nominal + d] + nominal[k + 1:] for k, p in enumerate(parameters) for d in (p.step, -p.step)
+                if p.low <= p.nominal + d <= p.high]
+        return np.array(rows)
+
+    def build(self, spec, model, i):
+        """Add to spec (of the nominal model) what edit() sizes."""
+
+    def edit(self, model, i, values):
+        """Put the effect into a compiled model."""
+
+    def command(self, signal, model, i, values):
+        """The Signal that reaches the actuator."""
+        return signal
+
+    def push(self, qfrc, xfrc, model, i, values):
+        """Add a constant force to qfrc (nv,) or xfrc (nbody, 6)."""
+
+    def force(self, models, i, values):
+        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,)) -> force to add, (S,nv).
+
+        models: S compiled models with every edit made; values (S, parameters).
+        """
+        return None
+
+    def measure(self, values):
+        """(offset, ratio, delay) of the sensor."""
+        return 0.0, 1.0, 0.0
+
+    def write(self, spec, model, i, values):
+        """Put the effect into spec, of the nominal model; return 'mjcf', 'measurement' or 'none'."""
+        raise NotImplementedError
+
+    def overrides(self, method):
+        """Whether the effect acts by this method."""
+        return getattr(type(self), method) is not getattr(Effect, method)
+
+
+def catalogue(cls):
+    """Class decorator: the effect joins EFFECTS, once for each kind of place."""
+    for kind in cls.kinds:
+        instance = cls()
+        instance.kind = kind
+        EFFECTS.append(instance)
+    return cls
+
+
+def turns(model, j):
+    """Whether joint j is a hinge."""
+    return model.jnt_type[j] == HINGE
+
+
+def angle(spec, model, j, value):
+    """A position of joint j as the spec writes it."""
+    return np.rad2deg(value) if spec.compiler.degree and turns(model, j) else value
+
+
+def passive(spec, name, trntype, target, **block):
+    """Add a dcmotor with neither inputs nor electrics: a carrier of cogging and friction, without a control."""
+    motor = spec.add_actuator(name=name, trntype=trntype, target=target)
+    motor.forcelimited = motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE  # whatever the defaults say
+    motor.set_to_dcmotor(motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_NONE), **block)
+    return motor
+
+
+def constant_force(spec, name, value, trntype, target):
+    """Add a constant force along a transmission: cogging with no poles."""
+    return passive(spec, name, trntype, target, cogging=[value, 0.0, np.pi / 2])

@@ -1,0 +1,373 @@
+"""Effects in a hinge or slide joint. Their scales follow the joint's own inertia."""
+
+import mujoco
+import numpy as np
+
+from effects import (HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Candidate, Effect, Parameter, Place, angle, catalogue, constant_force, passive,
+                     turns)
+
+# frictionloss as a nearly rigid constraint: with MuJoCo's default a stuck joint creeps
+SOLREF_FRICTION = (0.004, 1.0)
+SOLIMP_FRICTION = (0.999, 0.9999, 0.001, 0.5, 2.0)
+DISSIPATION = ('viscous_damping', 'coulomb_friction', 'quadratic_damping', 'back_emf')
+
+
+class JointEffect(Effect):
+    """An effect on a hinge or slide."""
+    kinds = ('joint',)
+
+    def fits(self, model, i):
+        return model.jnt_type[i] in (HINGE, SLIDE)
+
+    @staticmethod
+    def unit(model, i, hinge, slide):
+        return hinge if turns(model, i) else slide
+
+    @staticmethod
+    def scale(model, i):
+        """Inertia the joint moves in the reference pose."""
+        return model.dof_M0[model.jnt_dofadr[i]]
+
+    @staticmethod
+    def travel(model, i, recordings):
+        """All recorded positions and speeds of the joint, speeds by differences."""
+        q = model.jnt_qposadr[i]
+        speed = [np.diff(r.qpos[:, q]) / np.diff(r.time) for r in recordings]
+        position, speed = np.concatenate([r.qpos[:, q] for r in recordings]), np.concatenate(speed)
+        return position[np.isfinite(position)], abs(speed[np.isfinite(speed)])
+
+
+@catalogue
+class Armature(JointEffect):
+    """Inertia of rotor and gears, in the joint's own coordinate."""
+    name, constants, related = 'armature', True, ('mass', 'gain')
+
+    def parameters(self, model, i):
+        M = self.scale(model, i)
+        return Parameter('armature', self.unit(model, i, 'kg·m²', 'kg'), model.dof_armature[model.jnt_dofadr[i]], 0.0, HUGE * M, 0.01 * M),
+
+    def edit(self, model, i, values):
+        model.dof_armature[model.jnt_dofadr[i]] = values[0]
+
+    def write(self, spec, model, i, values):
+        spec.joint(model.joint(i).name).armature = values[0]
+        return 'mjcf'
+
+
+@catalogue
+class ViscousDamping(JointEffect):
+    """Force −d·v."""
+    name, simplicity, related = 'viscous_damping', 0, DISSIPATION
+
+    def parameters(self, model, i):
+        M, nominal = self.scale(model, i), model.dof_damping[model.jnt_dofadr[i]]
+        return Parameter('damping', self.unit(model, i, 'N·m·s/rad', 'N·s/m'), nominal, 0.0, HUGE * M, max(0.02 * M, 0.01 * nominal)),
+
+    def edit(self, model, i, values):
+        model.dof_damping[model.jnt_dofadr[i]] = values[0]
+
+    def write(self, spec, model, i, values):
+        spec.joint(model.joint(i).name).damping[0] = values[0]
+        return 'mjcf'
+
+
+@catalogue
+class QuadraticDamping(JointEffect):
+    """Force −d·v·|v|."""
+    name, related = 'quadratic_damping', DISSIPATION
+
+    def parameters(self, model, i):
+        M, nominal = self.scale(model, i), model.dof_dampingpoly[model.jnt_dofadr[i], 0]
+        return Parameter('damping2', self.unit(model, i, 'N·m·s²/rad²', 'N·s²/m²'), nominal, 0.0, HUGE * M, max(0.02 * M, 0.01 * nominal)),
+
+    def edit(self, model, i, values):
+        model.dof_dampingpoly[model.jnt_dofadr[i], 0] = values[0]
+
+    def write(self, spec, model, i, values):
+        spec.joint(model.joint(i).name).damping[1] = values[0]
+        return 'mjcf'
+
+
+def _set_frictionloss(model, i, value):
+    d = model.jnt_dofadr[i]
+    if not model.dof_frictionloss[d]:  # else the nominal model's own softness counts
+        model.dof_solref[d], model.dof_solimp[d] = SOLREF_FRICTION, SOLIMP_FRICTION
+    model.dof_frictionloss[d] = value
+
+
+@catalogue
+class CoulombFriction(JointEffect):
+    """Dry friction, which holds the joint below its limit."""
+    name, simplicity, related = 'coulomb_friction', 0, DISSIPATION
+
+    def parameters(self, model, i):
+        M, nominal = self.scale(model, i), model.dof_frictionloss[model.jnt_dofadr[i]]
+        return Parameter('frictionloss', self.unit(model, i, 'N·m', 'N'), nominal, 0.0, HUGE * M, max(0.05 * M, 0.01 * nominal)),
+
+    def edit(self, model, i, values):
+        _set_frictionloss(model, i, values[0])
+
+    def write(self, spec, model, i, values):
+        joint = spec.joint(model.joint(i).name)
+        if not joint.frictionloss:
+            joint.solref_friction, joint.solimp_friction = SOLREF_FRICTION, SOLIMP_FRICTION
+        joint.frictionloss = values[0]
+        return 'mjcf'
+
+
+@catalogue
+class StribeckFriction(JointEffect):
+    """Dry friction that falls from `static` at rest to `coulomb` when moving faster than `velocity`.
+
+    |F| = coulomb + (static − coulomb) exp(−(v/velocity)²): here as frictionloss `static`
+    and what it is too much once moving; in MJCF as the bristles of a LuGre model.
+    """
+    name, simplicity, related = 'stribeck_friction', 3, DISSIPATION
+
+    def parameters(self, model, i):
+        M, force = self.scale(model, i), self.unit(model, i, 'N·m', 'N')
+        return (Parameter('coulomb', force, 0.0, 0.0, HUGE * M, 0.05 * M), Parameter('static', force, 0.0, 0.0, HUGE * M, 0.05 * M),
+                Parameter('velocity', self.unit(model, i, 'rad/s', 'm/s'), 0.1, 1e-4, 100.0, 0.01))
+
+    def probes(self, model, i, recordings):
+        step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
+        return np.array([(step, ratio * step, v) for v in np.quantile(speed, [0.2, 0.5]) + 1e-4 for ratio in (1.5, 3.0)])
+
+    def edit(self, model, i, values):
+        _set_frictionloss(model, i, values[1])
+
+    def force(self, models, i, values):
+        d = models[0].jnt_dofadr[i]
+        coulomb, static, velocity = values.T
+
+        def released(qpos, qvel, ctrl, time):
+            v, out = qvel[:, d], np.zeros_like(qvel)
+            out[:, d] = (coulomb - static) * np.expm1(-(v / velocity)**2) * np.sign(v)
+            return out
+        return released
+
+    def write(self, spec, model, i, values):
+        joint, h = model.joint(i).name, spec.option.timestep
+        # as stiff as the time step can carry
+        stiffness = 0.04 * self.scale(model, i) / h**2
+        passive(spec, f'stribeck_friction:{joint}', JOINT_TRANSMISSION, joint, lugre=[stiffness, 0.2 * self.scale(model, i) / h, *values])
+        return 'mjcf'
+
+
+@catalogue
+class Stiffness(JointEffect):
+    """Force −k·(q − springref)."""
+    name, related = 'stiffness', ('spring_offset', 'nonlinear_stiffness', 'gain')
+
+    def parameters(self, model, i):
+        M, nominal = self.scale(model, i), model.jnt_stiffness[i]
+        return Parameter('stiffness', self.unit(model, i, 'N·m/rad', 'N/m'), nominal, 0.0, HUGE * M, max(0.1 * M, 0.01 * nominal)),
+
+    def edit(self, model, i, values):
+        model.jnt_stiffness[i] = values[0]
+
+    def write(self, spec, model, i, values):
+        spec.joint(model.joint(i).name).stiffness[0] = values[0]
+        return 'mjcf'
+
+
+@catalogue
+class NonlinearStiffness(JointEffect):
+    """Force −k·(q − springref)³."""
+    name, simplicity, related = 'nonlinear_stiffness', 2, ('stiffness', 'spring_offset')
+
+    def parameters(self, model, i):
+        M, nominal = self.scale(model, i), model.jnt_stiffnesspoly[i, 1]
+        return Parameter('stiffness3', self.unit(model, i, 'N·m/rad³', 'N/m³'), nominal, -HUGE * M, HUGE * M, max(0.1 * M, 0.01 * abs(nominal))),
+
+    def edit(self, model, i, values):
+        model.jnt_stiffnesspoly[i, 1] = values[0]
+
+    def write(self, spec, model, i, values):
+        spec.joint(model.joint(i).name).stiffness[2] = values[0]
+        return 'mjcf'
+
+
+@catalogue
+class SpringOffset(JointEffect):
+    """A constant force in the joint: a spring at rest elsewhere, a tilt, a cable."""
+    name, related = 'spring_offset', ('stiffness', 'bias', 'coulomb_friction')
+
+    def parameters(self, model, i):
+        M = self.scale(model, i)
+        return Parameter('torque', self.unit(model, i, 'N·m', 'N'), 0.0, -HUGE * M, HUGE * M, 0.05 * M),
+
+    def push(self, qfrc, xfrc, model, i, values):
+        qfrc[model.jnt_dofadr[i]] += values[0]
+
+    def write(self, spec, model, i, values):
+        joint = spec.joint(model.joint(i).name)
+        k = joint.stiffness
+        if k[0] > 0 and not k[1] and not k[2]:
+            joint.springref = joint.springref + angle(spec, model, i, values[0] / k[0])
+        else:
+            constant_force(spec, f'spring_offset:{joint.name}', values[0], JOINT_TRANSMISSION, joint.name)
+        return 'mjcf'
+
+
+@catalogue
+class Cogging(JointEffect):
+    """Force amplitude·sin(poles·q + phase), as of a motor's magnets."""
+    name, simplicity = 'cogging', 3
+
+    def parameters(self, model, i):
+        M = self.scale(model, i)
+        return (Parameter('amplitude', self.unit(model, i, 'N·m', 'N'), 0.0, -HUGE * M, HUGE * M, 0.05 * M),
+                Parameter('poles', self.unit(model, i, '1', '1/m'), 6.0, 0.5, 1000.0, 0.1), Parameter('phase', 'rad', 0.0, -10.0, 10.0, 0.1))
+
+    def probes(self, model, i, recordings):
+        position, _ = self.travel(model, i, recordings)
+        base = 1.0 if turns(model, i) else 2 * np.pi / max(np.ptp(position), 1e-3)
+        return np.array([(0.05 * self.scale(model, i), base * n, phase) for n in (2, 3, 4, 6, 8, 12, 16, 24, 36) for phase in (0.0, np.pi / 2)])
+
+    def _motor(self, model, i):
+        return f'cogging:{model.joint(i).name}'
+
+    def build(self, spec, model, i):
+        passive(spec, self._motor(model, i), JOINT_TRANSMISSION, model.joint(i).name, cogging=[1.0, 1.0, 0.0])
+
+    def edit(self, model, i, values):
+        model.actuator_biasprm[model.actuator(self._motor(model, i)).id, :3] = values
+
+    def write(self, spec, model, i, values):
+        passive(spec, self._motor(model, i), JOINT_TRANSMISSION, model.joint(i).name, cogging=list(values))
+        return 'mjcf'
+
+
+@catalogue
+class JointStop(JointEffect):
+    """The joint is limited to [low, high]."""
+    name, simplicity = 'joint_stop', 2
+    NEVER = 1e6  # a bound that is never met
+
+    def parameters(self, model, i):
+        low, high = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
+        unit = self.unit(model, i, 'rad', 'm')
+        return Parameter('low', unit, low, -self.NEVER, self.NEVER, 0.01), Parameter('high', unit, high, -self.NEVER, self.NEVER, -0.01)
+
+    def probes(self, model, i, recordings):
+        position, _ = self.travel(model, i, recordings)
+        low, high = (p.nominal for p in self.parameters(model, i))
+        a, b, c, d = np.quantile(position, [0.03, 0.15, 0.85, 0.97])
+        return np.array([(x, high) for x in (a, b) if x > low] + [(low, x) for x in (c, d) if x < high]).reshape(-1, 2)
+
+    def edit(self, model, i, values):
+        model.jnt_limited[i] = True
+        model.jnt_range[i] = np.clip(values, -self.NEVER, self.NEVER)
+
+    def write(self, spec, model, i, values):
+        joint = spec.joint(model.joint(i).name)
+        joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+        joint.range = [angle(spec, model, i, x) for x in np.clip(values, -self.NEVER, self.NEVER)]
+        return 'mjcf'
+
+
+@catalogue
+class Backlash(JointEffect):
+    """Play of width `gap` between motor and load; the sensor sits at the motor.
+
+    The recorded joint becomes the motor's; a second one in the same body, limited
+    to ± gap/2, carries the load. The motor side needs inertia of its own: without
+    armature it gets one per cent of the joint's.
+    """
+    name, simplicity = 'backlash', 3
+
+    def fits(self, model, i):
+        body = model.jnt_bodyid[i]
+        last = model.body_jntadr[body] + model.body_jntnum[body] - 1 == i
+        driven = ((model.actuator_trntype == JOINT_TRANSMISSION) & (model.actuator_trnid[:, 0] == i)).any()
+        return super().fits(model, i) and last and driven
+
+    def parameters(self, model, i):
+        return Parameter('gap', self.unit(model, i, 'rad', 'm'), 0.0, 0.0, 1.0, 0.005),
+
+    def probes(self, model, i, recordings):
+        position, _ = self.travel(model, i, recordings)
+        return np.ptp(position) * np.array([[0.01], [0.04]])
+
+    def build(self, spec, model, i):
+        motor = spec.joint(model.joint(i).name)
+        motor.armature = max(motor.armature, 0.01 * self.scale(model, i))
+        load = motor.parent.add_joint(name=f'backlash:{motor.name}', type=motor.type, pos=motor.pos, axis=motor.axis)
+        load.armature = load.frictionloss = load.ref = load.springref = load.margin = 0.0
+        load.damping, load.stiffness = [0.0] * 3, [0.0] * 3
+        load.limited, load.range = mujoco.mjtLimited.mjLIMITED_TRUE, [angle(spec, model, i, x) for x in (-0.5, 0.5)]
+        load.solref_limit, load.solimp_limit = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
+        return load
+
+    def edit(self, model, i, values):
+        model.jnt_range[model.joint(f'backlash:{model.joint(i).name}').id] = -values[0] / 2, values[0] / 2
+
+    def write(self, spec, model, i, values):
+        self.build(spec, model, i).range = [angle(spec, model, i, x) for x in (-values[0] / 2, values[0] / 2)]
+        return 'mjcf'
+
+
+class Unknown(JointEffect):
+    """A force in the joint that is some curve of one variable: its values at knots, linear between, flat beyond.
+
+    variable: 'position:<joint>', 'velocity:<joint>', 'control:<actuator>' or 'time'.
+    """
+    name, kind, simplicity = 'unknown', 'joint', 3
+
+    def __init__(self, variable, knots):
+        self.variable, self.knots = variable, tuple(float(x) for x in knots)
+
+    def __eq__(self, other):
+        return isinstance(other, Unknown) and (self.variable, self.knots) == (other.variable, other.knots)
+
+    def __hash__(self):
+        return hash((self.variable, self.knots))
+
+    def parameters(self, model, i):
+        M = self.scale(model, i)
+        return tuple(Parameter(f'force {k}', self.unit(model, i, 'N·m', 'N'), 0.0, -HUGE * M, HUGE * M, 0.05 * M) for k in range(len(self.knots)))
+
+    def force(self, models, i, values):
+        model, knots = models[0], np.array(self.knots)
+        d, (kind, _, name) = model.jnt_dofadr[i], self.variable.partition(':')
+        rows = np.arange(len(values))
+        if kind == 'control':
+            column = model.actuator_ctrladr[model.actuator(name).id]
+        elif kind != 'time':
+            column = model.joint(name).qposadr[0] if kind == 'position' else model.joint(name).dofadr[0]
+
+        def curve(qpos, qvel, ctrl, time):
+            x = time if kind == 'time' else {'position': qpos, 'velocity': qvel, 'control': ctrl}[kind][:, column]
+            k = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
+            f = np.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0)
+            out = np.zeros_like(qvel)
+            out[:, d] = (1 - f) * values[rows, k] + f * values[rows, k + 1]
+            return out
+        return curve
+
+    def write(self, spec, model, i, values):
+        """As a constant and a cubic in the joint's own position or velocity, where that is within 5 % of the curve."""
+        joint = spec.joint(model.joint(i).name)
+        x, y = np.array(self.knots), np.array(values)
+        if self.variable == f'velocity:{joint.name}':
+            powers, field = [x, x * abs(x), x**3], joint.damping
+        elif self.variable == f'position:{joint.name}':
+            shift = x - model.qpos_spring[model.jnt_qposadr[i]]
+            powers, field = [shift, shift**2, shift**3], joint.stiffness
+        else:
+            return 'none'
+        basis = np.stack([np.ones_like(x), *powers], axis=1)
+        size = abs(basis).max(axis=0)
+        fit = np.linalg.lstsq(basis / size, y, rcond=None)[0] / size
+        if abs(basis @ fit - y).max() > 0.05 * np.ptp(y):
+            return 'none'
+        field[:] = np.array(field) - fit[1:]
+        constant_force(spec, f'unknown:{joint.name}', fit[0], JOINT_TRANSMISSION, joint.name)
+        return 'mjcf'
+
+
+def curve(model, joint, variable, knots):
+    """Candidate for an unknown force in a joint: see Unknown. Parameters: the force at each knot."""
+    effect = Unknown(variable, knots)
+    return Candidate(effect, Place('joint', joint), effect.parameters(model, model.joint(joint).id))

@@ -1,0 +1,206 @@
+"""Effects of the world around the bodies: gravity, air, contacts, the simulator's own clock."""
+
+import mujoco
+import numpy as np
+
+from effects import Effect, Parameter, catalogue
+
+
+@catalogue
+class Gravity(Effect):
+    """Another gravity vector: a tilted base, another strength."""
+    name, kinds, simplicity, related = 'gravity', ('world',), 0, ('spring_offset', 'bias', 'mass')
+
+    def parameters(self, model, i):
+        return tuple(Parameter(n, 'm/s²', g, -30.0, 30.0, 0.05) for n, g in zip('xyz', model.opt.gravity))
+
+    def edit(self, model, i, values):
+        model.opt.gravity = values
+
+    def write(self, spec, model, i, values):
+        spec.option.gravity = values
+        return 'mjcf'
+
+
+@catalogue
+class Wind(Effect):
+    """Moving air; felt only where the model has density or viscosity."""
+    name, kinds = 'wind', ('world',)
+
+    def fits(self, model, i):
+        return model.opt.density > 0 or model.opt.viscosity > 0
+
+    def parameters(self, model, i):
+        return tuple(Parameter(n, 'm/s', w, -100.0, 100.0, 0.1) for n, w in zip('xyz', model.opt.wind))
+
+    def edit(self, model, i, values):
+        model.opt.wind = values
+
+    def write(self, spec, model, i, values):
+        spec.option.wind = values
+        return 'mjcf'
+
+
+@catalogue
+class AirDrag(Effect):
+    """A medium of some density around the bodies (MuJoCo's inertia-box drag)."""
+    name, kinds, related = 'air_drag', ('world',), ('quadratic_damping', 'viscous_damping')
+
+    def parameters(self, model, i):
+        return Parameter('density', 'kg/m³', model.opt.density, 0.0, 1e5, max(0.1, 0.01 * model.opt.density)),
+
+    def edit(self, model, i, values):
+        model.opt.density = values[0]
+
+    def write(self, spec, model, i, values):
+        spec.option.density = values[0]
+        return 'mjcf'
+
+
+@catalogue
+class TimeStep(Effect):
+    """The simulator's own integration step: what it leaves out is no physics."""
+    name, kinds = 'time_step', ('world',)
+
+    def parameters(self, model, i):
+        h = model.opt.timestep
+        return Parameter('seconds', 's', h, h / 16, h, -h / 2),
+
+    def probes(self, model, i, recordings):
+        return model.opt.timestep / np.array([[2.0], [4.0]])
+
+    def edit(self, model, i, values):
+        model.opt.timestep = values[0]
+
+    def write(self, spec, model, i, values):
+        spec.option.timestep = values[0]
+        return 'mjcf'
+
+
+# ---------------------------------------------------------------- contacts
+
+class ContactEffect(Effect):
+    """An effect on all contacts of one geom, which gets priority over its partners.
+
+    A pair's friction is the larger of the two and its solref a mixture, so the
+    geom first takes over what its pair has nominally.
+    """
+    kinds = ('geom',)
+
+    def fits(self, model, i):
+        return self.partner(model, i) is not None
+
+    @staticmethod
+    def partner(model, i):
+        """The geom this one mostly touches: a static one if any, else that with most friction."""
+        body, root = model.geom_bodyid, model.body_weldid
+        weld, mine = root[body], root[body[i]]
+        meets = ((model.geom_contype[i] & model.geom_conaffinity) | (model.geom_contype & model.geom_conaffinity[i])) != 0
+        meets &= weld != mine  # neither itself nor welded to it
+        parent = root[model.body_parentid[weld]]
+        kin = (parent == mine) & (mine != 0) | (weld == root[model.body_parentid[mine]]) & (weld != 0)
+        if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+            meets &= ~kin
+        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT) or not meets.any():
+            return None
+        return int(np.argmax(np.where(meets, model.geom_friction[:, 0] + 1e6 * (weld == 0), -1.0)))
+
+    @classmethod
+    def pair(cls, model, i):
+        """What geom i's contacts have nominally: condim, friction (3,), solref (2,), solimp (5,)."""
+        j = cls.partner(model, i)
+        if model.geom_priority[i] != model.geom_priority[j]:
+            k = max(i, j, key=lambda g: model.geom_priority[g])
+            return model.geom_condim[k], model.geom_friction[k].copy(), model.geom_solref[k].copy(), model.geom_solimp[k].copy()
+        a, b = model.geom_solmix[i], model.geom_solmix[j]
+        w = a / (a + b) if a + b > 1e-10 else 0.5
+        solref = [w * model.geom_solref[i] + (1 - w) * model.geom_solref[j], np.minimum(model.geom_solref[i], model.geom_solref[j])]
+        return (max(model.geom_condim[i], model.geom_condim[j]), np.maximum(model.geom_friction[i], model.geom_friction[j]),
+                solref[not (model.geom_solref[[i, j], 0] > 0).all()], w * model.geom_solimp[i] + (1 - w) * model.geom_solimp[j])
+
+    def edit(self, model, i, values):
+        if model.geom_priority[i] <= model.geom_priority.min():
+            condim, model.geom_friction[i], model.geom_solref[i], model.geom_solimp[i] = self.pair(model, i)
+            model.geom_condim[i] = condim
+            model.geom_priority[i] = model.geom_priority.max() + 1
+        self.change(model.geom_friction[i], model.geom_solref[i], values)
+
+    def write(self, spec, model, i, values):
+        geom = spec.geom(model.geom(i).name)
+        if geom.priority <= model.geom_priority.min():
+            geom.condim, geom.friction, geom.solref, geom.solimp = self.pair(model, i)
+            geom.priority = model.geom_priority.max() + 1
+        self.change(geom.friction, geom.solref, values)
+        return 'mjcf'
+
+
+def _direct(solref):
+    """(stiffness, damping) of a solref, in place if it was (timeconst, dampratio)."""
+    if solref[0] > 0:
+        solref[:] = -1 / (solref[0] * solref[1])**2, -2 / solref[0]
+    return -solref
+
+
+@catalogue
+class ContactFriction(ContactEffect):
+    """Sliding friction of all contacts of a geom."""
+    name, simplicity = 'contact_friction', 0
+
+    def parameters(self, model, i):
+        mu = self.pair(model, i)[1][0]
+        return Parameter('sliding', '1', mu, 1e-4, 10.0, 0.02 * mu),
+
+    @staticmethod
+    def change(friction, solref, values):
+        friction[0] = values[0]
+
+
+@catalogue
+class ContactStiffness(ContactEffect):
+    """Stiffness of all contacts of a geom, as an acceleration per depth."""
+    name, related = 'contact_stiffness', ('contact_damping',)
+
+    def parameters(self, model, i):
+        k = _direct(self.pair(model, i)[2])[0]
+        return Parameter('stiffness', '1/s²', k, 1e-3 * k, 1e3 * k, 0.02 * k),
+
+    @staticmethod
+    def change(friction, solref, values):
+        solref[:] = -values[0], -_direct(solref)[1]
+
+
+@catalogue
+class ContactDamping(ContactEffect):
+    """Damping of all contacts of a geom, as an acceleration per approach speed."""
+    name, related = 'contact_damping', ('contact_stiffness',)
+
+    def parameters(self, model, i):
+        b = _direct(self.pair(model, i)[2])[1]
+        return Parameter('damping', '1/s', b, 1e-3 * b, 1e3 * b, 0.02 * b),
+
+    @staticmethod
+    def change(friction, solref, values):
+        solref[:] = -_direct(solref)[0], -values[0]
+
+
+@catalogue
+class GroundHeight(Effect):
+    """A fixed geom lies higher or lower."""
+    name, kinds, constants = 'ground_height', ('geom',), True
+
+    def fits(self, model, i):
+        return model.body_weldid[model.geom_bodyid[i]] == 0 and ContactEffect.partner(model, i) is not None
+
+    def parameters(self, model, i):
+        z = model.geom_pos[i, 2]
+        return Parameter('z', 'm', z, z - 10.0, z + 10.0, 0.0005),
+
+    def edit(self, model, i, values):
+        model.geom_pos[i, 2] = values[0]
+
+    def write(self, spec, model, i, values):
+        spec.geom(model.geom(i).name).pos[2] = values[0]
+        return 'mjcf'
+
+
+# ---------------------------------------------------------------- forces from outside
