@@ -222,8 +222,8 @@ def _check_values(recording, model, warn):
             row = int(np.argmax(jumps))
             speed = np.percentile(jumps / np.diff(recording.time[~missing]), 90)
             if speed > (3000 if hinge else 340):
-                raise RecordingError(f"{where}: moves at {speed:.3g} {'rad/s' if hinge else 'm/s'} for long; convert it to "
-                                     f"{'rad' if hinge else 'm'}, and time to s")
+                raise RecordingError(f"{where}: moves at {speed:.3g} {'rad/s' if hinge else 'm/s'} most of the time; "
+                                     f"is it in {'degrees' if hinge else 'mm'}? convert it to {'rad' if hinge else 'm'}, and time to s")
             if hinge and abs(jumps[row] - 2 * np.pi) < 0.5 and jumps[row] > 20 * np.median(jumps) + 1e-6:
                 raise RecordingError(f"{where}: jumps by {jumps[row]:.3g} rad after data row {np.flatnonzero(~missing)[row] + 1}, a "
                                      "wrapped angle; unwrap it (numpy.unwrap)")
@@ -236,13 +236,13 @@ def _check_values(recording, model, warn):
                                  f"if it is in {unit}, convert it")
         if kind == "ctrl" and limited and (low < span[0] - 1e-3 * np.ptp(span) or high > span[1] + 1e-3 * np.ptp(span)):
             warn(recording, f"{column} leaves the model's ctrlrange {span[0]:g} to {span[1]:g}; MuJoCo clips it there")
-        for edge in (low, high):
-            clipped = values == edge
-            share = np.count_nonzero(clipped[1:] & clipped[:-1]) / rows
+        kept = {edge: np.count_nonzero((values[1:] == edge) & (values[:-1] == edge)) / rows for edge in (low, high)}
+        switched = kept[low] + kept[high] > 0.8  # a square wave is not saturation
+        for edge, share in kept.items():
             at_range = kind == "ctrl" and limited and abs(edge - span[int(edge == high)]) < 1e-6 * (1 + abs(edge))
-            if share > 0.03 and (at_range or largest > 0 and abs(edge) == largest or kind == "ctrl" and low == -high):
-                warn(recording, f"{column} stays at its extreme {edge:g} in {100 * share:.0f} % of the rows: saturated"
-                     + (" (at ctrlrange)" if at_range else ", clipped, or at a stop" if kind == "qpos" else ""))
+            if share > 0.03 and (at_range or not switched and (edge if kind == "qpos" else low == -high)):
+                warn(recording, f"{column} stays at its extreme {edge:g} in {100 * share:.0f} % of the rows: "
+                     + ("saturated at ctrlrange" if at_range else "saturated" if kind == "ctrl" else "clipped, or at a stop"))
 
 
 def _check_rates(recording, model, warn):

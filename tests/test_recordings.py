@@ -1,0 +1,265 @@
+import glob
+import io
+import os
+import sys
+import time
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+from readers import columns_of
+from recordings import Recording, RecordingError, check, load
+from tests.malformed import HEADER, archive, arm, run, text, whole
+
+REAL = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "shared", "recordings")
+FREE = """
+<mujoco><worldbody>
+  <geom type="plane" size="1 1 1"/>
+  <body><freejoint name="cube"/><geom type="box" size=".1 .1 .1"/></body>
+  <body><joint type="ball"/><geom size=".1" pos="0 0 1"/></body>
+  <body><joint type="slide" axis="0 0 1"/><geom size=".1" pos="0 0 2"/></body>
+</worldbody><actuator><motor joint="a:b"/></actuator></mujoco>
+""".replace('<joint type="slide"', '<joint name="a:b" type="slide"')
+
+
+@pytest.fixture(scope="module")
+def model():
+    return arm()
+
+
+@pytest.fixture(scope="module")
+def good():
+    return run()
+
+
+def put(folder, data, name="run.csv"):
+    (folder / name).write_bytes(data)
+    return folder / name
+
+
+def recording(table, name="run.csv"):
+    return Recording(name, table[:, 0], table[:, 1:3], table[:, 3:5], table[:, 5:7])
+
+
+def test_csv_and_npz_hold_the_same(tmp_path, model, good):
+    a, = load(put(tmp_path, text(good)), model)
+    b, = load(str(put(tmp_path, archive(**whole(good)), "run.npz")), model)
+    assert (a.name, b.name) == ("run.csv", "run.npz")
+    for field in ("time", "qpos", "qvel", "ctrl"):
+        np.testing.assert_allclose(getattr(a, field), getattr(b, field), rtol=1e-8, atol=1e-12)
+    np.testing.assert_array_equal(b.qpos, good[:, 1:3])
+
+
+def test_columns_in_any_order_by_name_or_index(tmp_path, model, good):
+    order = [5, 2, 0, 6, 1]
+    names = {"qpos:elbow": "qpos:1", "ctrl:shoulder_motor": "ctrl:0"}
+    data = text(good[:, order], [names.get(HEADER[k], " " + HEADER[k]) for k in order])
+    got, = load(put(tmp_path, b"\xef\xbb\xbf" + data.replace(b"\n", b"\r\n")), model)  # and as Excel would write it
+    np.testing.assert_allclose(got.qpos, good[:, 1:3], rtol=1e-8)
+    np.testing.assert_allclose(got.ctrl, good[:, 5:7], rtol=1e-8)
+    assert np.isnan(got.qvel).all()
+
+
+def test_empty_cells_and_nan_are_not_measured(tmp_path, model, good):
+    lines = text(good).decode().split("\n")
+    cells = lines[4].split(",")
+    lines[4] = ",".join([cells[0], "", "NaN", *cells[3:]])
+    got, = load(put(tmp_path, "\n".join(lines).encode()), model)
+    assert np.isnan(got.qpos[3]).all() and np.isfinite(np.delete(got.qpos, 3, 0)).all()
+    np.testing.assert_allclose(got.ctrl, good[:, 5:7], rtol=1e-8)
+
+
+def test_free_ball_and_sensor_columns(tmp_path):
+    model = mujoco.MjModel.from_xml_string(FREE)
+    names = list(columns_of(model))
+    assert names == [*(f"qpos:cube:{k}" for k in range(7)), *(f"qvel:cube:{k}" for k in range(6)), *(f"qpos:1:{k}" for k in range(4)),
+                     *(f"qvel:1:{k}" for k in range(3)), "qpos:a:b", "qvel:a:b", "ctrl:0"]
+    rng = np.random.default_rng(0)
+    rows, qpos = 30, rng.normal(size=(30, model.nq))
+    for start in (3, 7):
+        qpos[:, start:start + 4] /= np.linalg.norm(qpos[:, start:start + 4], axis=1, keepdims=True)
+    table = np.column_stack([np.arange(rows) * 0.01, qpos, rng.normal(size=(rows, 1))])
+    header = ["time", *(n for n in names if n.startswith(("qpos", "ctrl")))]
+    got, = load(put(tmp_path, text(table, header)), model)
+    np.testing.assert_allclose(got.qpos, qpos, rtol=1e-7)
+    table[4, 5] += 3
+    with pytest.raises(RecordingError, match="row 6.*quaternion"):
+        load(put(tmp_path, text(table, header)), model)
+    table[4, 5] = np.nan
+    with pytest.raises(RecordingError, match="row 6.*partly nan"):
+        load(put(tmp_path, text(table, header)), model)
+    with pytest.raises(RecordingError, match="7 components"):
+        load(put(tmp_path, text(table, ["time", "qpos:cube", *header[2:]])), model)
+
+
+def test_sensors(tmp_path, model, good):
+    got, = load(put(tmp_path, text(np.column_stack([good, good[:, 1]]), [*HEADER, "sensor:encoder"])), model)
+    np.testing.assert_allclose(got.sensors["encoder"], good[:, 1:2], rtol=1e-8)
+    got, = load(put(tmp_path, archive(**whole(good), **{"sensor:encoder": good[:, 1]}), "run.npz"), model)
+    np.testing.assert_array_equal(got.sensors["encoder"], good[:, 1:2])
+
+
+def test_files_of_one_name_are_told_apart(tmp_path, model, good):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        put(tmp_path / folder, text(good))
+    assert [r.name for r in load([tmp_path / "a/run.csv", tmp_path / "b/run.csv"], model)] == ["a/run.csv", "b/run.csv"]
+
+
+def test_two_hundred_thousand_rows_in_seconds(tmp_path, model):
+    rows = 200_000
+    table = np.column_stack([np.arange(rows) * 0.001, np.random.default_rng(0).normal(size=(rows, 6))])
+    stream = io.BytesIO()
+    np.savetxt(stream, table, delimiter=",", header=",".join(HEADER), comments="", fmt="%.7g")
+    path = put(tmp_path, stream.getvalue())
+    start = time.perf_counter()
+    assert load(path, model)[0].qpos.shape == (rows, 2)
+    assert time.perf_counter() - start < 6
+
+
+def test_a_sound_recording_raises_no_doubt(model, good):
+    assert check([recording(good)], model) == []
+    assert check([recording(run(seed=s), f"run{s}.csv") for s in range(1, 4)], model) == []
+
+
+def test_irregular_sampling_is_sound(model, good):
+    keep = np.sort(np.random.default_rng(0).choice(len(good), 250, replace=False))
+    assert not [w for w in check([recording(good[keep])], model) if "gap" not in w]
+
+
+@pytest.mark.parametrize("rig", ["arm_pendulum_single", "cube_toss", "double_pendulum", "emps"])
+def test_real_recordings_are_not_refused(rig):
+    folder = os.path.join(REAL, rig)
+    if not os.path.isdir(folder):
+        pytest.skip("recordings are not here")
+    for path in glob.glob(os.path.join(folder, "model*.xml")):
+        model = mujoco.MjModel.from_xml_path(path)
+        check(load(sorted(glob.glob(os.path.join(folder, "*.csv"))), model), model)
+
+
+def test_warnings(model, good):
+    def said(table):
+        return " | ".join(check([recording(table)], model))
+
+    saturated = good.copy()
+    saturated[:, 6] = np.clip(5 * good[:, 6], -1, 1)
+    assert "ctrl:elbow_motor stays at its extreme" in said(saturated) and "ctrlrange" in said(saturated)
+    outside = good.copy()
+    outside[:, 6] *= 8
+    assert "leaves the model's ctrlrange" in said(outside)
+    constant = good.copy()
+    constant[:, 6] = 0.2
+    assert "ctrl:elbow_motor is constant at 0.2" in said(constant)
+    clipped = good.copy()
+    clipped[:, 1] = np.minimum(good[:, 1], 0.7 * good[:, 1].max())
+    clipped[:, 3] = np.nan
+    assert "qpos:shoulder stays at its extreme" in said(clipped)
+    holes = good.copy()
+    holes[50:150, 2] = np.nan
+    assert "qpos:elbow has nan in 25 % of its rows" in said(holes)
+    unmeasured = good.copy()
+    unmeasured[:, 2] = unmeasured[:, 4] = np.nan
+    assert "qpos:elbow is not measured" in said(unmeasured)
+    assert "gap of" in said(np.delete(good, slice(100, 107), 0))
+    still = good[:60].copy()
+    still[:, 1:] = 0
+    assert "nothing moves" in " | ".join(check([recording(good), recording(still, "still.csv")], model))
+
+
+def test_same_warning_for_many_files_is_one_line(model, good):
+    constant = good.copy()
+    constant[:, 6] = 0
+    assert check([recording(constant, f"run{k}.csv") for k in range(5)], model) == [
+        "run0.csv and 4 more: ctrl:elbow_motor is constant at 0; nothing can be said about what only it would show"]
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+def test_a_slide_in_millimetres(unit):
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" damping="20"/>
+        <geom size=".1" mass="10"/></body></worldbody><actuator><motor name="drive" joint="x"/></actuator></mujoco>""")
+    data, rows = mujoco.MjData(model), []
+    for k in range(800):
+        data.ctrl[0] = 40 * np.sin(3 * data.time) + 20 * np.sin(7 * data.time)
+        if k % 5 == 0:
+            rows.append([data.time, data.qpos[0] * (1000 if unit == "mm" else 1), data.ctrl[0]])
+        mujoco.mj_step(model, data)
+    rows = np.array(rows)
+    one = Recording("run.csv", rows[:, 0], rows[:, 1:2], np.full((len(rows), 1), np.nan), rows[:, 2:])
+    if unit == "m":
+        assert check([one], model) == []
+    else:
+        with pytest.raises(RecordingError, match="qpos:x.*mm"):
+            check([one], model)
+
+
+# --- fuzzing: whatever stands in a file, it is a sound recording or one line ---
+
+def read_or_refuse(path, model):
+    try:
+        got = load(path, model)
+        check(got, model)
+    except RecordingError as error:
+        assert "\n" not in str(error) and len(str(error)) > 10
+        return
+    for r in got:
+        assert r.time.dtype == float and np.isfinite(r.time).all() and (np.diff(r.time) > 0).all()
+        assert r.qpos.shape == (len(r.time), 2) == r.qvel.shape == r.ctrl.shape
+        assert np.isfinite(r.ctrl).all() and not np.isinf(r.qpos).any() and not np.isinf(r.qvel).any()
+
+
+FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SMALL = text(run(0.6))
+SMALL_NPZ = archive(**whole(run(0.6)))
+
+
+@FUZZ
+@given(st.binary(max_size=300))
+def test_fuzz_bytes(tmp_path, model, data):
+    read_or_refuse(put(tmp_path, data), model)
+    read_or_refuse(put(tmp_path, data, "run.npz"), model)
+    read_or_refuse(put(tmp_path, b"PK\x03\x04" + data, "run.npz"), model)
+
+
+@FUZZ
+@given(st.lists(st.tuples(st.floats(0, 1), st.sampled_from([b",", b"\n", b"", b"nan", b"1e300", b"-", b"\xff", b"\x00", b'"', b";", b" "]),
+                          st.integers(0, 30)), min_size=1, max_size=4))
+def test_fuzz_damaged_csv(tmp_path, model, edits):
+    data = SMALL
+    for where, what, cut in edits:
+        at = int(where * len(data))
+        data = data[:at] + what + data[at + cut:]
+    read_or_refuse(put(tmp_path, data), model)
+
+
+@FUZZ
+@given(st.lists(st.tuples(st.floats(0, 1), st.binary(max_size=6), st.integers(0, 40)), min_size=1, max_size=4))
+def test_fuzz_damaged_npz(tmp_path, model, edits):
+    data = SMALL_NPZ
+    for where, what, cut in edits:
+        at = int(where * len(data))
+        data = data[:at] + what + data[at + cut:]
+    read_or_refuse(put(tmp_path, data, "run.npz"), model)
+
+
+CELL = st.one_of(st.floats().map(repr), st.integers(-10**20, 10**20).map(str), st.text(max_size=8), st.just(""))
+
+
+@FUZZ
+@given(st.lists(st.sampled_from([*HEADER, "qpos:0", "ctrl:7", "time ", "qpos", "sensor:encoder", ""]), min_size=1, max_size=9),
+       st.lists(st.lists(CELL, min_size=1, max_size=9), max_size=6))
+def test_fuzz_tables(tmp_path, model, header, rows):
+    read_or_refuse(put(tmp_path, "\n".join(",".join(r) for r in [header, *rows]).encode("utf-8", "surrogatepass")), model)
+
+
+@FUZZ
+@given(st.lists(st.lists(st.floats(width=32) | st.floats(-3, 3), min_size=7, max_size=7), min_size=1, max_size=40), st.booleans())
+def test_fuzz_values(tmp_path, model, rows, clock):
+    table = np.array(rows)
+    if clock:
+        table[:, 0] = 0.02 * np.arange(len(table))
+    read_or_refuse(put(tmp_path, text(table)), model)
+    read_or_refuse(put(tmp_path, archive(**whole(table)), "run.npz"), model)
