@@ -86,7 +86,7 @@ for (const figure of document.querySelectorAll("figure.animation")) {
   const name = () => { button.textContent = playing ? "pause" : "play"; };
   const step = now => {
     if (!playing) return;
-    const t = ((now - from) / 1000) % (seconds + pause);
+    const t = Math.max(0, now - from) / 1000 % (seconds + pause);
     show(Math.min(frames - 1, Math.floor(t / seconds * frames)));
     requestAnimationFrame(step);
   };

@@ -1,0 +1,332 @@
+"""The report: JSON against the contract's schema, whole files or none, and the page in a real browser."""
+import errno
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import types
+from html.parser import HTMLParser
+
+import mujoco
+import numpy as np
+import pytest
+
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+import drawing
+import figures
+import motion
+import report
+from recordings import Recording
+from tests.malformed import ARM, arm, run
+
+BROWSER = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if path), None)
+
+
+def finding(effect, kind, name, nominal, value, half, unit, **more):
+    return {"effect": effect, "place": {"kind": kind, "name": name},
+            "parameters": [{"name": "value", "nominal": nominal, "value": value, "low": value - half, "high": value + half, "unit": unit}],
+            "evidence": {"held_out_error_removed": 0.6, "p_value": 1e-40}, "depends_on": [f"velocity:{name}"], "when": None,
+            "written_as": "mjcf", "also_possible": [], **more}
+
+
+def recordings(count, seed):
+    return [Recording(f"run{seed + k}.csv", t[:, 0], t[:, 1:3], t[:, 3:5], t[:, 5:7]) for k, t in enumerate(run(3.0, seed + s) for s in range(count))]
+
+
+@pytest.fixture
+def diagnosis():
+    """A diagnosis as identify makes them, of ARM with friction at the elbow, numbers made up."""
+    train, held = recordings(2, 0), recordings(1, 5)
+    findings = [finding("coulomb_friction", "joint", "elbow", 0.0, 0.12, 0.004, "N·m",
+                        also_possible=[{"effect": "dead_zone", "place": {"kind": "actuator", "name": "elbow_motor"},
+                                        "parameters": [{"name": "half_width", "nominal": 0.0, "value": 0.11, "unit": "N·m"}]}]),
+                finding("mass", "body", "lower", 0.5, 0.55, 0.01, "kg"),
+                finding("gravity", "world", "world", -9.81, np.float64(-9.7), 0.02, "m/s²", written_as="none")]
+    channels = {f"qpos:{name}": {"before": 0.03, "after": 0.002, "floor": 0.001, "unit": "rad"} for name in ("shoulder", "elbow")}
+    curve = [{"seconds": s, "before": 30 * s + 1, "after": 2 * s + 1, "floor": 1.0} for s in np.linspace(0.05, 1, 12)]
+    summary = {"format": 1, "verdict": "mismatch", "noise": {"qpos:shoulder": 0.001, "qpos:elbow": np.float32(0.001)}, "findings": findings,
+               "fit": {"train": {"before": 31.0, "after": 2.0, "floor": 1.0},
+                       "held_out": {"before": 30.0, "after": 2.0, "floor": 1.0, "horizon_s": 0.3, "curve": curve, "channels": channels}},
+               "unexplained": {"fraction": 0.05, "place": {"kind": "joint", "name": "elbow"}, "depends_on": ["position:elbow"]},
+               "warnings": ["run5.csv: ctrl:elbow_motor <stays> at its extreme"]}
+    traces = [{"recording": r.name, "channel": f"qpos:{name}", "time": r.time, "measured": r.qpos[:, k], "nominal": r.qpos[:, k] + 0.1,
+               "corrected": np.where(np.arange(len(r.time)) % 30 == 0, np.nan, r.qpos[:, k])} for r in held for k, name in enumerate(("shoulder", "elbow"))]
+    v = np.random.default_rng(0).normal(size=900)
+    residuals = [{"finding": 0, "variable": "velocity:elbow", "x": v, "before": -0.12 * np.sign(v), "after": 0.01 * v, "unit": "N·m", "x_unit": "rad/s"}]
+    ranking = [{"effect": "coulomb_friction", "place": {"kind": "joint", "name": "elbow"}, "error_removed": 0.6, "p_value": 0.0},
+               {"effect": "wind", "place": {"kind": "world", "name": "world"}, "error_removed": float("nan"), "p_value": float("nan")}]
+    curves = [{"finding": 1, "variable": "position:elbow", "x": np.linspace(-1, 1, 9), "force": np.linspace(0, 1, 9), "unit": "N·m"}]
+    return types.SimpleNamespace(
+        summary=summary, corrected_xml=ARM.replace('range="-2.9', 'frictionloss="0.12" range="-2.9'), world=types.SimpleNamespace(model=arm()),
+        settings={"elbow": (0.12,)}, ranking=ranking, traces=traces, residuals=residuals, advice=["Drive the elbow slowly & reverse it."],
+        train=train, held_out=held, unknown_curves=curves)
+
+
+@pytest.fixture
+def matched(diagnosis):
+    diagnosis.summary = {**diagnosis.summary, "verdict": "match", "findings": [], "warnings": []}
+    diagnosis.settings, diagnosis.residuals, diagnosis.advice, diagnosis.unknown_curves = {}, [], [], []
+    return diagnosis
+
+
+# --- diagnosis.json ---
+
+NUMBER, TEXT = (int, float), str
+PLACE = {"kind": TEXT, "name": TEXT}
+PARAMETER = {"name": TEXT, "nominal": (int, float, type(None)), "value": NUMBER, "unit": TEXT}
+ERROR = {"before": NUMBER, "after": NUMBER, "floor": NUMBER}
+SCHEMA = {"format": int, "verdict": TEXT, "noise": dict, "findings": [
+    {"effect": TEXT, "place": PLACE, "parameters": [{**PARAMETER, "low": NUMBER, "high": NUMBER}],
+     "evidence": {"held_out_error_removed": NUMBER, "p_value": NUMBER}, "depends_on": [TEXT], "when": (dict, type(None)), "written_as": TEXT,
+     "also_possible": [{"effect": TEXT, "place": PLACE, "parameters": [PARAMETER]}]}],
+    "fit": {"train": ERROR, "held_out": {**ERROR, "horizon_s": NUMBER, "curve": list}},
+    "unexplained": {"fraction": NUMBER, "place": (dict, type(None)), "depends_on": [TEXT]}}
+
+
+def conforms(value, schema, where="$"):
+    """Asserts that value has the schema's shape: dicts with at least these keys, lists of one form, types."""
+    if isinstance(schema, dict):
+        assert isinstance(value, dict), where
+        for key, inner in schema.items():
+            assert key in value, f"{where}.{key} is missing"
+            conforms(value[key], inner, f"{where}.{key}")
+    elif isinstance(schema, list):
+        assert isinstance(value, list), where
+        for k, item in enumerate(value):
+            conforms(item, schema[0], f"{where}[{k}]")
+    else:
+        assert isinstance(value, schema) and not (isinstance(value, bool) and schema is not bool), f"{where} is {value!r}"
+
+
+def contract(summary):
+    """Asserts everything the contract says of diagnosis.json that a shape cannot."""
+    conforms(summary, SCHEMA)
+    assert summary["format"] == 1 and summary["verdict"] in ("match", "mismatch")
+    assert (summary["verdict"] == "mismatch") == bool(summary["findings"])
+    assert all(isinstance(v, NUMBER) and v > 0 for v in summary["noise"].values())
+    for found in summary["findings"]:
+        assert found["place"]["kind"] in ("joint", "actuator", "body", "geom", "sensor", "world")
+        assert found["place"]["kind"] != "world" or found["place"]["name"] == "world"
+        assert found["written_as"] in ("mjcf", "measurement", "none") and len(found["also_possible"]) <= 3
+        for p in found["parameters"]:
+            assert p["low"] <= p["value"] <= p["high"]
+        for name in found["depends_on"]:
+            assert name == "time" or re.fullmatch(r"(position|velocity|control|contact):.+", name)
+        when = found["when"]
+        assert when is None or "time" in when and len(when["time"]) == 2 or all(len(limits) == 2 for limits in when.values())
+
+
+def strict(path):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+    return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+
+
+def test_json_keeps_the_contract(diagnosis, tmp_path):
+    report.write(diagnosis, tmp_path / "report")
+    contract(strict(tmp_path / "report/diagnosis.json"))
+
+
+def test_json_is_strict():
+    odd = {"a": np.float32(1.5), "b": np.nan, "c": np.int64(3), "d": (np.array([1.0, np.inf]), True), 5: np.bool_(False)}
+    assert json.loads(json.dumps(report.plain(odd), allow_nan=False)) == {"a": 1.5, "b": None, "c": 3, "d": [[1.0, None], True], "5": False}
+
+
+# --- whole files or none ---
+
+def test_three_files_and_the_unknown_curve(diagnosis, tmp_path):
+    out = tmp_path / "a/b/report"
+    report.write(diagnosis, out)
+    assert sorted(os.listdir(out)) == ["corrected.xml", "diagnosis.json", "report.html", "unknown_1.csv"]
+    assert (out / "corrected.xml").read_text() == diagnosis.corrected_xml
+    assert np.loadtxt(out / "unknown_1.csv", delimiter=",", skiprows=1).shape == (9, 2)
+    mask = os.umask(0)
+    os.umask(mask)
+    assert stat.S_IMODE(os.stat(out / "report.html").st_mode) == 0o666 & ~mask
+    report.write(diagnosis, out)  # again, over the old ones
+    assert len(os.listdir(out)) == 4
+
+
+@pytest.mark.parametrize("fails", ["fsync", "replace"])
+def test_a_full_disk_leaves_nothing(diagnosis, tmp_path, monkeypatch, fails):
+    def full(*args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(os, fails, full)
+    with pytest.raises(report.ReportError, match="No space left") as error:
+        report.write(diagnosis, tmp_path / "report")
+    assert "\n" not in str(error.value) and not (tmp_path / "report").exists()
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept/diagnosis.json").write_text("old")
+    with pytest.raises(report.ReportError):
+        report.write(diagnosis, tmp_path / "kept")
+    assert os.listdir(tmp_path / "kept") == ["diagnosis.json"] and (tmp_path / "kept/diagnosis.json").read_text() == "old"
+
+
+def test_a_really_full_disk(diagnosis):
+    """The kernel's own ENOSPC, where this test may mount one megabyte."""
+    if os.geteuid() != 0:
+        pytest.skip("needs to mount")
+    folder = "/tmp/full_disk_of_the_report_test"
+    os.makedirs(folder, exist_ok=True)
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], capture_output=True).returncode:
+        os.rmdir(folder)
+        pytest.skip("cannot mount")
+    try:
+        with pytest.raises(report.ReportError, match="space"):
+            report.write(diagnosis, os.path.join(folder, "report"))
+        assert os.listdir(folder) == []
+        subprocess.run(["mount", "-o", "remount,ro", folder], check=True)
+        with pytest.raises(report.ReportError, match="cannot be written"):
+            report.check_folder(os.path.join(folder, "report"))
+    finally:
+        subprocess.run(["umount", folder], check=True)
+        os.rmdir(folder)
+
+
+def test_folder_is_checked_before_the_work(tmp_path):
+    report.check_folder(tmp_path / "new/deep")
+    (tmp_path / "file").write_text("")
+    for bad in ("file", "file/below"):
+        with pytest.raises(report.ReportError, match="not a folder"):
+            report.check_folder(tmp_path / bad)
+    assert os.listdir(tmp_path) == ["file"]
+
+
+# --- drawings ---
+
+@pytest.mark.parametrize("low, high", [(0, 1), (-3.2, 7.9), (1e-6, 3e-6), (-1e5, 2e5)])
+def test_ticks_are_round_and_inside(low, high):
+    found = figures.ticks(low, high)
+    assert 3 <= len(found) <= 11 and all(low - 1e-9 * abs(low) <= t <= high + 1e-9 * abs(high) for t in found)
+    assert len({round(b - a, 12) for a, b in zip(found, found[1:])}) == 1 or low == 1e-6
+
+
+def test_thinned_curves_keep_extremes_and_gaps():
+    x = np.linspace(0, 1, 20000)
+    y = np.sin(40 * x)
+    y[5000], y[12000:12010] = 9.0, np.nan
+    a, b = figures.thin(x, y)
+    assert len(a) < 1600 and np.nanmax(b) == 9.0 and np.nanmin(b) == np.nanmin(y) and np.isnan(b).any() and (np.diff(a) > 0).all()
+
+
+def test_hull_against_area_of_known_shapes():
+    rng = np.random.default_rng(0)
+    square = np.concatenate([rng.uniform(0, 1, (200, 2)), [[0, 0], [1, 0], [1, 1], [0, 1]]])
+    corners = drawing.hull(square)
+    assert sorted(map(tuple, corners)) == [(0, 0), (0, 1), (1, 0), (1, 1)]
+
+
+def test_planar_mechanisms_are_seen_along_their_hinges():
+    axes, towards = drawing.view(arm(), np.zeros(2))
+    np.testing.assert_allclose(axes, [[1, 0, 0], [0, 0, 1]], atol=1e-12)  # x to the right, z up
+    np.testing.assert_allclose(towards, [0, -1, 0], atol=1e-12)
+
+
+def test_outline_of_a_rod_lies_where_the_kinematics_put_it():
+    model = arm()
+    axes, towards = drawing.view(model, np.zeros(2))
+    angle = 0.7
+    shapes = {g: outline for g, outline, _ in drawing.outlines(model, np.array([angle, 0.0]), axes, towards)}
+    tip = -0.55 * np.array([np.sin(angle), np.cos(angle)])  # both rods in line: 0.3 + 0.25 m from the shoulder
+    far = shapes[1][np.argmax(np.linalg.norm(shapes[1], axis=1))]
+    assert abs(np.linalg.norm(far) - 0.565) < 1e-3 and np.linalg.norm(far - tip) < 0.02
+
+
+def test_motion_starts_as_recorded_and_follows_stock_mujoco():
+    model, recording = arm(), recordings(1, 3)[0]
+    columns = motion.columns_in(model, model)
+    got = motion.simulate(model, recording, 20, 60, columns)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = recording.qpos[20], recording.qvel[20]
+    for row in range(20, 60):
+        np.testing.assert_allclose(got[row - 20], data.qpos, atol=1e-9)
+        data.ctrl[:] = recording.ctrl[row]
+        mujoco.mj_step(model, data, nstep=5)
+
+
+def test_overlay_finds_recorded_joints_in_a_model_with_more(diagnosis):
+    spec = mujoco.MjSpec.from_string(diagnosis.corrected_xml)
+    spec.body("upper").add_joint(name="backlash", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0])
+    qpos, dof = motion.columns_in(spec.compile(), arm())
+    assert qpos.tolist() == [0, 2] == dof.tolist()
+
+
+# --- the page ---
+
+class Tags(HTMLParser):
+    """Checks that tags close in order, and gathers addresses."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.addresses = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.addresses += [value for key, value in attrs if key in ("src", "href", "action", "data")]
+        if tag not in ("meta", "link", "br", "input"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        pass
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.mark.parametrize("kind", ["diagnosis", "matched"])
+def test_page_is_well_formed_and_self_contained(kind, request):
+    page = report.html_page(request.getfixturevalue(kind))
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == [] and set(tags.addresses) == {"data:,"}
+    assert not re.search(r"https?://|url\(|@import", page)
+    assert len(page) < 2_000_000 and "nan" not in re.findall(r'd="([^"]*)"', page)
+    assert "<stays>" not in page
+
+
+def test_page_says_it_all(diagnosis):
+    page = report.html_page(diagnosis)
+    for words in ("joint elbow: Coulomb friction 0.120 ± 0.004 N·m was left out", "dead zone", "Drive the elbow slowly &amp; reverse it.",
+                  "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "residual (N·m)", "badmark"):
+        assert words in page, words
+
+
+def test_page_of_a_match_claims_nothing(matched):
+    page = report.html_page(matched)
+    assert "Nothing is missing" in page and "What is wrong" not in page and 'class="badmark"' not in page
+
+
+PROBE = """<script>
+const problems = [];
+addEventListener("error", e => problems.push(String(e.message)), true);
+addEventListener("unhandledrejection", e => problems.push(String(e.reason)));
+addEventListener("load", () => setTimeout(() => {
+  const wide = [...document.querySelectorAll("main *")].filter(e => !e.closest(".scroll") && e.getBoundingClientRect().right > innerWidth + 1);
+  const result = {width: innerWidth, page: document.documentElement.scrollWidth, wide: wide.map(e => e.tagName + "." + e.className),
+    fetched: performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith("data:")), problems,
+    charts: document.querySelectorAll("svg").length, layers: [...document.querySelectorAll(".layer")].map(e => e.getAttribute("d").length)};
+  parent.postMessage("PROBE" + JSON.stringify(result) + "END", "*");
+}, 300));
+</script>"""
+PHONE = """<!DOCTYPE html><body style="margin:0"><p></p><iframe src="page.html" width="390" height="844" style="border:0"></iframe>
+<script>addEventListener("message", e => { document.querySelector("p").textContent = e.data; });</script>"""  # no window is as narrow
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser")
+@pytest.mark.parametrize("kind", ["diagnosis", "matched"])
+def test_page_in_a_browser_on_a_phone(kind, request, tmp_path):
+    page = report.html_page(request.getfixturevalue(kind))
+    (tmp_path / "page.html").write_text(page.replace("<style>", PROBE + "<style>", 1), encoding="utf-8")
+    (tmp_path / "phone.html").write_text(PHONE)
+    done = subprocess.run([BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--enable-logging=stderr",
+                           f"--user-data-dir={tmp_path / 'profile'}", "--window-size=800,900", "--virtual-time-budget=3000", "--dump-dom",
+                           f"file://{tmp_path / 'phone.html'}"], capture_output=True, text=True, timeout=60)
+    found = re.search(r"PROBE(\{.*\})END", done.stdout)
+    assert found, done.stderr[-2000:]
+    result = json.loads(found.group(1).replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
+    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    assert result["problems"] == [] and result["fetched"] == []
+    assert result["page"] <= result["width"] and result["wide"] == [], result
+    assert result["width"] == 390 and result["charts"] > 4 and all(result["layers"]), result
