@@ -318,6 +318,8 @@ def main():
     else:
         import proof_page
         proof_page.write(read(arguments.table), arguments.out)
+        for line in proof_page.lines([proof_page.parse(row) for row in read(arguments.table)]):
+            print("{:100s} {:>9s} {:>8s}  {}".format(*line))
 
 
 if __name__ == "__main__":
