@@ -13,6 +13,7 @@ import numpy as np
 
 ARM = """
 <mujoco model="arm">
+  <compiler angle="radian"/>
   <option timestep="0.002" integrator="implicitfast"/>
   <worldbody>
     <body name="upper">
@@ -199,7 +200,7 @@ def cases():
     table("time constant", "repeats", lambda x: x.__setitem__((slice(None), 0), 1.0))
     table("time in ms", "milliseconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] * 1e3))
     table("time in us", "microseconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] * 1e6))
-    table("time in ns since 1970", "nanoseconds", lambda x: x.__setitem__((slice(None), 0), 1.7e18 + x[:, 0] * 1e9))
+    table("time in ns", "nanoseconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] * 1e9))
     table("time in days", "seconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] / 86400 / 100))
     table("a gap", "gap", lambda x: np.delete(x, slice(100, 200), 0))
 
