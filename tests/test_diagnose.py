@@ -1,0 +1,179 @@
+"""The command: what it refuses and how, how it splits, what it says, and that a diagnosis comes out."""
+import json
+import os
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+sys.path.insert(0, ROOT)
+import diagnose
+import wording
+from recordings import Recording, RecordingError
+from tests.malformed import ARM, cases, run, text
+
+CASES = cases()
+
+
+def refused(code, out, err, folder, before, says):
+    """Exit status 2, one line on stderr with the right hint, nothing on stdout, nothing left behind."""
+    assert code == 2
+    assert out == ""
+    lines = err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("diagnose.py: ") and "Traceback" not in err, err
+    assert says in lines[0], err
+    assert sorted(os.listdir(folder)) == before
+
+
+def test_the_corpus_is_large():
+    assert len(CASES) >= 60
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_malformed_input(name, tmp_path, capfd, monkeypatch):
+    argv = CASES[name].write(tmp_path)
+    before = sorted(os.listdir(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    code = diagnose.main(argv)
+    captured = capfd.readouterr()
+    refused(code, captured.out, captured.err, tmp_path, before, CASES[name].says)
+
+
+@pytest.mark.parametrize("name", ["binary rubbish", "NPZ with a pickle", "model that blows up", "no such environment"])
+def test_malformed_input_as_a_process(name, tmp_path):
+    argv = CASES[name].write(tmp_path)
+    before = sorted(os.listdir(tmp_path))
+    done = subprocess.run([sys.executable, os.path.join(ROOT, "diagnose.py"), *argv], capture_output=True, text=True, cwd=tmp_path)
+    refused(done.returncode, done.stdout, done.stderr, tmp_path, before, CASES[name].says)
+
+
+def recording(rows, name):
+    t = np.arange(rows) * 0.01
+    return Recording(name, t, np.sin(t)[:, None], np.full((rows, 1), np.nan), np.zeros((rows, 0)))
+
+
+def test_split_keeps_back_every_third_or_the_last_part():
+    many = [recording(50, f"{k}") for k in range(7)]
+    train, held = diagnose.split(many)
+    assert [r.name for r in train] == ["0", "1", "3", "4", "6"] and [r.name for r in held] == ["2", "5"]
+    train, held = diagnose.split(many[:1])
+    assert len(train[0].time) + len(held[0].time) == 50 and 14 <= len(held[0].time) <= 16
+    assert held[0].time[0] > train[0].time[-1]
+    train, held = diagnose.split(many[:2])
+    assert [r.name for r in train] == ["0", "1"] == [r.name for r in held]
+
+
+def test_one_file_for_two_purposes_is_refused(tmp_path):
+    (tmp_path / "arm.xml").write_text(ARM)
+    (tmp_path / "run.csv").write_bytes(text(run()))
+    with pytest.raises(RecordingError, match="held out"):
+        diagnose.diagnose(tmp_path / "arm.xml", tmp_path / "run.csv", held_out=[tmp_path / "run.csv"])
+    with pytest.raises(diagnose.ModelError, match="no such"):
+        diagnose.diagnose(tmp_path / "leg.xml", tmp_path / "run.csv")
+
+
+def pendulum(frictionloss):
+    return f"""<mujoco model="pendulum"><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="rod">
+      <joint name="pivot" axis="0 1 0" damping="0.02" frictionloss="{frictionloss}" solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"/>
+      <geom name="stick" type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+      <actuator><motor name="motor" joint="pivot"/></actuator></mujoco>"""
+
+
+def swing(frictionloss, seed, seconds=6.0, noise=5e-4):
+    """CSV of a driven pendulum, positions only."""
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(pendulum(frictionloss))
+    data, rows = mujoco.MjData(model), []
+    tones, phases = rng.uniform(0.5, 2.0, 3), rng.uniform(0, 6, 3)
+    for _ in range(int(seconds / 0.01)):
+        torque = 1.2 * np.sin(2 * np.pi * tones * data.time + phases).sum()
+        rows.append([data.time, data.qpos[0] + noise * rng.normal(), torque])
+        data.ctrl[0] = torque
+        mujoco.mj_step(model, data, nstep=5)
+    return text(rows, ["time", "qpos:pivot", "ctrl:motor"])
+
+
+@pytest.fixture(scope="module")
+def command(tmp_path_factory):
+    """(folder, finished process) of one real run of the command: a pendulum whose Coulomb friction was left out."""
+    folder = tmp_path_factory.mktemp("command")
+    (folder / "sim.xml").write_text(pendulum(0))
+    for k in range(3):
+        (folder / f"run{k}.csv").write_bytes(swing(0.15, k))
+    done = subprocess.run([sys.executable, os.path.join(ROOT, "diagnose.py"), "--model", "sim.xml", "--recordings", "run0.csv", "run1.csv", "run2.csv",
+                           "--out", "report/"], capture_output=True, text=True, cwd=folder)
+    return folder, done
+
+
+def test_the_command_names_the_friction(command):
+    folder, done = command
+    assert done.returncode == 0 and done.stderr == "", done.stderr  # no terminal, no progress
+    assert "joint pivot: Coulomb friction 0.15" in done.stdout and "was left out" in done.stdout
+    assert "Held-out error 0.3 s ahead falls from" in done.stdout
+    assert sorted(os.listdir(folder)) == ["report", "run0.csv", "run1.csv", "run2.csv", "sim.xml"]
+    assert {"corrected.xml", "diagnosis.json", "report.html"} <= set(os.listdir(folder / "report"))
+
+
+def test_the_files_of_the_command(command):
+    folder, _ = command
+    summary = json.loads((folder / "report/diagnosis.json").read_text(), parse_constant=pytest.fail)
+    first = summary["findings"][0]
+    assert (first["effect"], first["place"]) == ("coulomb_friction", {"kind": "joint", "name": "pivot"})
+    assert abs(first["parameters"][0]["value"] - 0.15) < 0.15 * 0.05
+    corrected = mujoco.MjModel.from_xml_path(str(folder / "report/corrected.xml"))
+    assert abs(corrected.joint("pivot").frictionloss[0] - 0.15) < 0.15 * 0.05
+
+
+def test_the_function_reads_as_the_command_does(command):
+    folder, _ = command
+    calls = []
+    diagnosis = diagnose.diagnose(folder / "sim.xml", [folder / f"run{k}.csv" for k in range(3)], progress=lambda *args: calls.append(args))
+    summary = json.loads((folder / "report/diagnosis.json").read_text())
+    assert diagnosis.summary["findings"][0]["effect"] == summary["findings"][0]["effect"]
+    assert diagnosis.summary["findings"][0]["parameters"][0]["value"] == summary["findings"][0]["parameters"][0]["value"]  # same numbers
+    assert calls and all(0 <= share <= 1 and isinstance(what, str) for share, what in calls)
+
+
+# --- words ---
+
+def parameter(name, nominal, value, half, unit):
+    return {"name": name, "nominal": nominal, "value": value, "low": value - half, "high": value + half, "unit": unit}
+
+
+def finding(effect, kind, name, *parameters, **more):
+    return {"effect": effect, "place": {"kind": kind, "name": name}, "parameters": list(parameters), "when": None, "depends_on": [], **more}
+
+
+@pytest.mark.parametrize("given, words", [
+    (finding("coulomb_friction", "joint", "elbow", parameter("frictionloss", 0.0, 0.1214, 0.0042, "N·m")),
+     "joint elbow: Coulomb friction 0.121 ± 0.004 N·m was left out"),
+    (finding("mass", "body", "torso", parameter("mass", 3.56, 4.52, 0.031, "kg")), "body torso: mass 4.52 ± 0.03 kg instead of 3.56 (+27 %)"),
+    (finding("delay", "actuator", "drive", parameter("seconds", 0.0, 0.0123, 0.0012, "s")), "actuator drive: delay 0.0123 ± 0.0012 s was left out"),
+    (finding("external_force", "body", "cart", parameter("x", 0.0, 2.0, 0.1, "N"), when={"recording": "run3.csv", "time": [2.0, 7.5]}),
+     "body cart: external force 2.00 ± 0.10 N was left out, in run3.csv from 2.00 to 7.50 s"),
+    (finding("unknown", "joint", "elbow", depends_on=["position:elbow", "contact:floor"]),
+     "joint elbow: a force that the catalogue has no name for, depending on the position of elbow and contact with floor"),
+    (finding("gravity", "world", "world", parameter("z", -9.81, -9.5, 0.01, "m/s²")), "the world: gravity: z -9.500 ± 0.010 m/s² instead of -9.81 (-3 %)"),
+])
+def test_findings_in_words(given, words):
+    assert wording.finding_words(given) == words
+
+
+def test_error_in_words():
+    fit = {"before": 31, "after": 2, "floor": 1, "horizon_s": 0.3,
+           "channels": {"qpos:a": {"before": 0.002, "after": 0.002, "floor": 0.001, "unit": "rad"},
+                        "qpos:elbow": {"before": 0.031, "after": 0.002, "floor": 0.001, "unit": "rad"}}}
+    summary = {"verdict": "mismatch", "fit": {"held_out": fit}}
+    assert wording.error_words(summary) == "held-out error 0.3 s ahead falls from 31 to 2.0 mrad at elbow; the sensors' noise is 1.0 mrad"
+    del fit["channels"]
+    assert "falls from 31 to 2.0 times the noise" in wording.error_words(summary)
+
+
+@pytest.mark.parametrize("value, words", [(0.0005, "0.000500"), (411, "411"), (1.23e-7, "1.23e-7"), (0, "0"), (float("nan"), "–"), (2.5e9, "2.50e9")])
+def test_numbers(value, words):
+    assert wording.number(value) == words
+
+
