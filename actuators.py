@@ -48,6 +48,23 @@ class ActuatorEffect(Effect):
         return actuator
 
 
+def runge_kutta(model):
+    return model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
+
+
+def refine(spec, longest):
+    """Divide the spec's time step so that it is no longer than `longest`."""
+    spec.option.timestep /= max(1, np.ceil(spec.option.timestep / longest - 1e-9))
+
+
+def set_lag(actuator, seconds, model):
+    """Give a spec's actuator a first-order lag: as of the end of a step, or continuous where the integrator is."""
+    actuator.actdim, actuator.dynprm[0] = 1, seconds
+    actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
+    if runge_kutta(model):
+        actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTER, False
+
+
 @catalogue
 class Gain(ActuatorEffect):
     """The actuator is stronger or weaker by a ratio, feedback of a servo included."""
@@ -127,29 +144,6 @@ class Saturation(ActuatorEffect):
 
 
 @catalogue
-class Delay(ActuatorEffect):
-    """The command acts later, by any fraction of a time step."""
-    name, simplicity, related = 'delay', 0, ('lag', 'sensor_delay', 'time_step')
-
-    def parameters(self, model, i):
-        return Parameter('seconds', 's', _nominal_delay(model, i), 0.0, 1.0, 0.001),
-
-    def command(self, signal, model, i, values):
-        return replace(signal, delay=values[0])
-
-    def write(self, spec, model, i, values):
-        step, actuator = spec.option.timestep, spec.actuator(model.actuator(i).name)
-        if values[0] < step:  # MuJoCo rounds a shorter delay up to one step
-            spec.option.timestep = step = step / np.ceil(step / values[0])
-        actuator.delay, actuator.interp, actuator.nsample = values[0], 1, int(np.ceil(values[0] / step - 1e-9)) + 1
-        return 'mjcf'
-
-
-def _nominal_delay(model, i):
-    return max(model.actuator_delay[i], model.opt.timestep) if model.actuator_delay[i] > 0 else 0.0
-
-
-@catalogue
 class Lag(ActuatorEffect):
     """The command passes a first-order filter."""
     name, related = 'lag', ('delay', 'back_emf')
@@ -164,13 +158,41 @@ class Lag(ActuatorEffect):
         return replace(signal, lag=values[0])
 
     def write(self, spec, model, i, values):
-        actuator = self.general(spec, model, i)
-        actuator.dyntype, actuator.actdim = mujoco.mjtDyn.mjDYN_FILTEREXACT, 1
-        actuator.dynprm[0] = values[0]
-        actuator.actearly = model.opt.integrator != int(mujoco.mjtIntegrator.mjINT_RK4)
-        if not actuator.actearly and values[0] < spec.option.timestep:  # Runge-Kutta explodes on a faster filter
-            spec.option.timestep /= np.ceil(spec.option.timestep / values[0])
+        set_lag(self.general(spec, model, i), values[0], model)
+        if runge_kutta(model):  # explodes on a filter faster than a step
+            refine(spec, values[0])
         return 'mjcf'
+
+
+@catalogue
+class Delay(ActuatorEffect):
+    """The command acts later, by any fraction of a time step."""
+    name, simplicity, related = 'delay', 0, ('lag', 'sensor_delay', 'time_step')
+
+    def parameters(self, model, i):
+        return Parameter('seconds', 's', _nominal_delay(model, i), 0.0, 1.0, 0.001),
+
+    def command(self, signal, model, i, values):
+        return replace(signal, delay=values[0])
+
+    def write(self, spec, model, i, values):
+        """MuJoCo reads its history at the time of each force evaluation, and not later than what the last step left there."""
+        seconds, actuator = values[0], spec.actuator(model.actuator(i).name)
+        if runge_kutta(model):  # evaluates half a step later on average, a whole one at the last
+            refine(spec, seconds / 1.5)
+            seconds += spec.option.timestep / 2
+        elif seconds < spec.option.timestep and actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
+            # a finer step would change the whole simulation: spread the command over following steps, late by as much on average
+            set_lag(self.general(spec, model, i), spec.option.timestep / np.log1p(spec.option.timestep / seconds), model)
+            return 'mjcf'
+        else:
+            refine(spec, seconds)
+        actuator.delay, actuator.interp = seconds, 1
+        return 'mjcf'
+
+
+def _nominal_delay(model, i):
+    return max(model.actuator_delay[i], model.opt.timestep) if model.actuator_delay[i] > 0 else 0.0
 
 
 @catalogue

@@ -185,9 +185,9 @@ class Engine:
             t = np.array([window.recording.time[window.first] - signal.delay])
             if i >= 0 and kind in FILTERS:
                 act[i] = Signal(signal.time, signal.value, lag=max(m.actuator_dynprm[a, 0], 1e-10)).filtered(t)[0]
-            elif i >= 0 and kind == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):
+            elif i >= 0 and kind == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # from zero at the first row
                 limits = m.actuator_actrange[a] if m.actuator_actlimited[a] else (-np.inf, np.inf)
-                act[i] = np.clip(signal.integral(t)[0], *limits)
+                act[i] = np.clip(signal.integral(np.maximum(t, signal.time[0]))[0], *limits)
         return act
 
     def _rollout(self, batch, drives, out):

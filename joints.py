@@ -147,10 +147,11 @@ class StribeckFriction(JointEffect):
         return released
 
     def write(self, spec, model, i, values):
-        joint, h = model.joint(i).name, spec.option.timestep
-        # as stiff as the time step can carry
-        stiffness = 0.04 * self.scale(model, i) / h**2
-        passive(spec, f'stribeck_friction:{joint}', JOINT_TRANSMISSION, joint, lugre=[stiffness, 0.2 * self.scale(model, i) / h, *values])
+        # bristles as stiff as the time step can carry; damped, and so softer, where they would ring and explode
+        joint, per_step = model.joint(i).name, 1 / spec.option.timestep
+        stiffness, damping = (0.01, 0.1) if spec.option.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else (0.1, 0.0)
+        M = 1 / model.dof_invweight0[model.jnt_dofadr[i]]  # what the joint feels, its neighbours free
+        passive(spec, f'stribeck_friction:{joint}', JOINT_TRANSMISSION, joint, lugre=[stiffness * M * per_step**2, damping * M * per_step, *values])
         return 'mjcf'
 
 

@@ -111,7 +111,7 @@ class LinkLength(Effect):
 
     def parameters(self, model, i):
         length = np.linalg.norm(model.body_pos[i])
-        return Parameter('metres', 'm', length, 0.1 * length, 10 * length, 0.01 * length),
+        return Parameter('length', 'm', length, 0.1 * length, 10 * length, 0.01 * length),
 
     def edit(self, model, i, values):
         model.body_pos[i] *= values[0] / np.linalg.norm(model.body_pos[i])
@@ -183,6 +183,10 @@ class SensorBias(SensorEffect):
         joint, offset = spec.joint(model.joint(i).name), angle(spec, model, i, values[0])
         joint.ref, joint.springref = joint.ref + offset, joint.springref + offset
         joint.range = [bound + offset for bound in joint.range]
+        for actuator in spec.actuators:  # a servo goes on controlling the true position
+            if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == joint.name:
+                actuator.type = mujoco.mjtActuator.mjACTUATOR_GENERAL
+                actuator.biasprm[0] -= actuator.biasprm[1] * actuator.gear[0] * values[0]
         return 'mjcf'
 
 

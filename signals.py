@@ -11,7 +11,7 @@ SLACK = 1e-3  # of a time step: a row this near to a step's edge is taken to lie
 class Signal:
     """value[i] (T,) is held from time[i] to time[i+1] and seen `delay` seconds later, through a first-order `lag`.
 
-    Before the recording began the control was zero, as after mj_resetData.
+    Before the recording began its first control was held, and the lag at rest in it.
     """
     time: np.ndarray
     value: np.ndarray
@@ -28,7 +28,7 @@ class Signal:
         """
         edges = start - self.delay + step * np.arange(count + 1)
         first, last = self._row(edges[:-1] + SLACK * step), self._row(edges[1:] - SLACK * step)
-        held = np.concatenate([[0.0], self.value])[first + 1]
+        held = self.value[first]
         if (first != last).any() or self.lag:
             mean = np.diff(self.integral(edges)) / step
             held = np.where(first == last, held, mean)
@@ -38,22 +38,24 @@ class Signal:
         return held - self.lag / step * np.diff(act) if average else act[1:]
 
     def _row(self, t):
-        return np.searchsorted(self.time, t, side='right') - 1
+        """The row that holds at times t; row 0 also before the recording."""
+        return np.maximum(np.searchsorted(self.time, t, side='right') - 1, 0)
 
     def integral(self, t):
+        """Of the undelayed, unfiltered control, from the first row to times t."""
         area = np.concatenate([[0.0], np.cumsum(self.value[:-1] * np.diff(self.time))])
         i = self._row(t)
-        return np.where(i < 0, 0.0, area[i] + self.value[i] * (t - self.time[i]))
+        return area[i] + self.value[i] * (t - self.time[i])
 
     def filtered(self, t):
-        """The lag's output at times t of the undelayed signal: exact, from rest at the first row."""
+        """The lag's output at times t of the undelayed control, exactly."""
         # act[i+1] = decay[i] act[i] + (1 - decay[i]) value[i], as a scan that doubles its reach
-        decay = np.exp(-np.diff(self.time) / self.lag)
-        act, reach = self.value[:-1] * (1 - decay), 1
+        decay = np.concatenate([[0.0], np.exp(-np.diff(self.time) / self.lag)])
+        act, reach = np.concatenate([self.value[:1], self.value[:-1] * (1 - decay[1:])]), 1
         while reach < len(act) and decay.max() > 1e-18:
             act[reach:] += decay[reach:] * act[:-reach]
             decay[reach:] = decay[reach:] * decay[:-reach]
             decay[:reach] = 0.0
             reach *= 2
-        act, i = np.concatenate([[0.0], act]), self._row(t)
-        return np.where(i < 0, 0.0, self.value[i] + (act[i] - self.value[i]) * np.exp(-np.maximum(t - self.time[i], 0.0) / self.lag))
+        i = self._row(t)
+        return self.value[i] + (act[i] - self.value[i]) * np.exp(-np.maximum(t - self.time[i], 0.0) / self.lag)

@@ -122,7 +122,8 @@ class World:
         start_qpos (S, nq), start_qvel (S, nv): the state at each window's first row as
             the joints' sensors show it (under sensor_bias and the like of the setting).
         windows: S Windows. Each runs on its recording's control, held between rows;
-            delays, lags and filters run on from the control recorded before the window.
+            delays, lags and filters run on from the control recorded before the window (before
+            the first row: its control, for ever).
         refine: divide the simulator's time step by this integer.
         sensors: also predict the model's sensors.
 
@@ -168,7 +169,7 @@ class World:
         for candidate, values in Case(self.model, setting, 1).on:
             i = candidate.effect.id(self.model, candidate.place.name)
             written[candidate] = 'none' if candidate.when else candidate.effect.write(spec, self.model, i, values)
-        for actuator in spec.actuators:  # the history must still reach back if the time step became finer
+        for actuator in spec.actuators:  # the history must reach back far enough, whatever the time step became
             if actuator.delay > 0:
                 actuator.nsample = max(actuator.nsample, int(np.ceil(actuator.delay / spec.option.timestep - 1e-9)) + 1)
         folder = Path(self.spec.modelfiledir).absolute()
