@@ -4,8 +4,8 @@
     diagnosis.summary["findings"]; diagnosis.corrected_xml
 
 1. Noise from differences of the recordings and from short windows that the nominal model can follow.
-2. Windows short enough that the nominal model's misfit stays moderate; start states by Levenberg-Marquardt.
-3. Search over all candidates (selection.Search), again with longer windows until the misfit allows 0.3 s.
+2. The longest windows that the nominal model still follows; start states by Levenberg-Marquardt.
+3. Search over all candidates (selection.Search), again with the longer windows that the better model then follows.
 4. Final refit on more windows: intervals from the sandwich covariance between clusters of windows.
 5. What could stand in each finding's place; what is left unexplained.
 Held-out recordings enter only after everything is chosen and fitted.
@@ -25,7 +25,9 @@ from recordings import RecordingError
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
 FINAL_STEPS = 30000
 LEAST_ROWS = 8  # of a window
-FOLLOWS = 12.0  # residual, in noises, above which windows are shortened
+ROUNDS = 3  # of search, each with longer windows
+LONGEST = 1.3  # s, of a window
+FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
 
 
 @dataclass(frozen=True)
@@ -52,12 +54,16 @@ def identify(world, train, held_out, progress=None):
     say = progress or (lambda done, message: None)
     say(0.0, "estimating noise")
     position_noise, velocity_noise = noise_of(world, train)
-    say(0.1, "first windows")
-    spans = spans_for(world, train, position_noise, velocity_noise)
-    hypothesis, ranking = shooting.Hypothesis(), []
-    for i, span in enumerate(spans):
-        problem = problem_of(world, train, span, SEARCH_STEPS, position_noise, velocity_noise)
-        say(0.1 + 0.5 * i / len(spans), f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
+    data = world, train, position_noise, velocity_noise
+    hypothesis, ranking, span = shooting.Hypothesis(), [], 0.0
+    for i in range(ROUNDS):
+        say(0.05 + 0.2 * i, "choosing windows")
+        longer = span_for(*data, hypothesis, at_least=span)
+        if i and longer < 1.5 * span:
+            break
+        span = longer
+        problem = problem_of(*data, span, SEARCH_STEPS)
+        say(0.1 + 0.2 * i, f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
         search = selection.Search(world, problem, train)
         fit = shooting.fit_starts(problem, hypothesis)
         if hypothesis.effects:
@@ -67,14 +73,15 @@ def identify(world, train, held_out, progress=None):
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     say(0.6, "alternatives")
-    replaced = {c: also_possible(fit.subset(search.few), search.alternatives(fit, c)) for c in fit.hypothesis.candidates}
+    fit, possible = search.settle(fit)
+    hypothesis = fit.hypothesis
     say(0.8, "intervals")
-    final = problem_of(world, train, spans[-1], FINAL_STEPS, position_noise, velocity_noise)
+    final = problem_of(*data, span, FINAL_STEPS)
     fit = shooting.fit_starts(final, hypothesis)
     if hypothesis.effects:
         [fit] = shooting.solve(final, [hypothesis], fit)
     say(0.9, "held-out error")
-    return assemble(world, train, held_out, fit, selection.Search(world, final, train), replaced, ranking,
+    return assemble(world, train, held_out, fit, selection.Search(world, final, train), possible, ranking,
                     position_noise, velocity_noise)
 
 
@@ -96,30 +103,52 @@ def windows_for(world, recordings, span, steps):
         sample = np.median(np.diff(r.time))
         every += cut.consecutive(r, max(span, LEAST_ROWS * sample))
     duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
-    number = max(24, int(steps * world.model.opt.timestep / duration))
+    number = max(20, int(steps * world.model.opt.timestep / duration))
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]
 
 
-def problem_of(world, recordings, span, steps, position_noise, velocity_noise):
+def problem_of(world, recordings, position_noise, velocity_noise, span, steps):
     return shooting.Problem(world, windows_for(world, recordings, span, steps), position_noise, velocity_noise)
 
 
-def misfit(problem, fit):
-    """Residual in noises: the median over windows, which a few impacts do not move."""
-    rows = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
-    return float(np.sqrt(np.median(fit.chi2 / rows)))
+def follows(problem, fit, share_allowed):
+    """Whether a model follows its windows: the median residual is a few noises, or a small part of the motion."""
+    weight, size = problem.weight, problem.weight[0].size
+    rows = np.maximum((weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
+    if np.sqrt(np.median(fit.chi2 / rows)) < FOLLOWS:
+        return True
+    gap = fit.residual[:, :size].reshape(weight.shape) / np.where(weight > 0, weight, np.inf)
+    moved = np.nanstd(cut.difference(problem.model, problem.measured_qpos[:, :1], problem.measured_qpos), axis=1)
+    share = np.sqrt((gap[..., :problem.model.nv] ** 2).mean(1)) / np.maximum(moved, 1e-12)
+    return bool(np.nanmedian(share) < share_allowed)
 
 
-def spans_for(world, train, position_noise, velocity_noise):
-    """Window spans to search with, the first short enough for the nominal model to follow, the last the reported horizon."""
-    spans, span = [], cut.HORIZON
+def span_for(world, train, position_noise, velocity_noise, hypothesis, at_least=0.0):
+    """The longest window span that the model with a hypothesis follows, from a few samples up.
+
+    Up to LONGEST (or a few dozen rows) while the residual is a few noises; where recordings are far more precise than
+    any model, longer windows only add nonlinearity, and half the reported horizon is enough.
+    """
     sample = np.median([np.median(np.diff(r.time)) for r in train])
-    while True:
-        spans.insert(0, span)
-        problem = problem_of(world, train, span, SEARCH_STEPS / 4, position_noise, velocity_noise)
-        if misfit(problem, shooting.fit_starts(problem, shooting.Hypothesis())) < FOLLOWS or span / 2 < 1.5 * LEAST_ROWS * sample:
-            return spans if len(spans) < 3 else [spans[0], spans[-1]]
+    duration = np.median([np.ptp(r.time) for r in train])
+    shortest = max(LEAST_ROWS * sample, at_least)
+    whole = 1.0 if duration < 60 * sample else 0.5
+    longest = max(shortest, min(max(LONGEST, 40 * sample), whole * duration))
+
+    def followed(span):
+        problem = problem_of(world, train, position_noise, velocity_noise, span, SEARCH_STEPS / 4)
+        return follows(problem, shooting.fit_starts(problem, hypothesis), FOLLOWS_SHARE if span < 0.6 * cut.HORIZON else 0.0)
+
+    span = float(np.clip(cut.HORIZON / 2, shortest, longest))
+    if followed(span):
+        while span < longest and followed(min(2 * span, longest)):
+            span = min(2 * span, longest)
+        return span
+    while span / 2 >= shortest:
         span /= 2
+        if followed(span):
+            break
+    return span
 
 
 # ---- report ------------------------------------------------------------------------------------
@@ -162,7 +191,7 @@ def noise_by_channel(model, position_noise):
             if np.isfinite(position_noise[dofs]).all()}
 
 
-def assemble(world, train, held_out, fit, search, replaced, ranking, position_noise, velocity_noise):
+def assemble(world, train, held_out, fit, search, possible, ranking, position_noise, velocity_noise):
     settings, model = fit.hypothesis.settings, world.model
     noise = evidence.reporting_noise(position_noise)
     bounds = intervals(search, fit)
@@ -178,7 +207,7 @@ def assemble(world, train, held_out, fit, search, replaced, ranking, position_no
             "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
                          "p_value": search.significance(fit, candidate)[0]},
             "depends_on": depends_on(candidate), "when": None, "written_as": written[candidate],
-            "also_possible": replaced[candidate]})
+            "also_possible": also_possible(possible[candidate])})
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
                "held_out": figure(world, settings, held, position_noise, velocity_noise)}
@@ -220,11 +249,8 @@ def depends_on(candidate):
         candidate.effect, "depends_on") else []
 
 
-def also_possible(fit, others, most=3):
-    """Other effects that bring the squared residual to within 5 % in error of the chosen one's."""
-    best = [(f, c) for f, c in others if f.chi2.sum() < (1 + selection.SAME) ** 2 * fit.chi2.sum()]
-    return [{"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, f.hypothesis.settings[c])}
-            for f, c in best[:most]]
+def also_possible(others, most=3):
+    return [{"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, values)} for _, c, values in others[:most]]
 
 
 def ranking_rows(trials, fit):

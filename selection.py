@@ -2,7 +2,7 @@
 
     search = Search(world, problem, recordings)
     fit, steps = search.run()           # shooting.Fit of the chosen hypothesis, one Step per addition
-    search.alternatives(fit, effect)    # what could stand in an effect's place
+    fit, possible = search.settle(fit)  # the simplest of equals; what else could stand in each effect's place
 
 An effect is added when its gain is significant after correction for the number of candidates (clusters of windows,
 scores.wald), when clusters that its value was not fitted to gain too, and when the residual falls noticeably.
@@ -18,7 +18,7 @@ from probes import values_to_try
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 WORTH = 0.03  # least fall of the squared residual, of what is there, that an effect must bring
-FEW = 24  # windows, at least, of a refit that only has to tell hypotheses apart
+FEW = 16  # windows, at least, of a refit that only has to tell hypotheses apart
 SAME = 0.05  # effects whose refits differ by less than this in error cannot be told apart
 
 
@@ -84,17 +84,20 @@ class Search:
         if self.pieces > 1:
             labels = np.arange(len(problem.windows) * self.pieces)
         self.labels = labels
+        by_window = labels.reshape(len(problem.windows), self.pieces)[self.few].ravel()
+        self.few_labels = np.unique(by_window, return_inverse=True)[1]
         self.progress = progress or (lambda message: None)
         self.ranking = []
 
     # ---- linear scan ---------------------------------------------------------------------------
 
-    def reduced(self, fit, settings):
+    def reduced(self, fit, settings, problem):
         """Cluster sums (C, k, k), (C, k) of columns with start states and the fit's own parameters projected out; chi2."""
         base, moves = shooting.perturbed(fit.hypothesis)
-        slope = shooting.columns(self.problem, [fit], [base + settings])[0]
-        scan = shooting.project(self.problem, fit, slope, self.pieces)
-        gram, score = scores.summed(self.labels, scan.gram), scores.summed(self.labels, scan.score)
+        slope = shooting.columns(problem, [fit], [base + settings])[0]
+        scan = shooting.project(problem, fit, slope, self.pieces)
+        labels = self.labels if problem is self.problem else self.few_labels
+        gram, score = scores.summed(labels, scan.gram), scores.summed(labels, scan.score)
         k = len(base)
         if k:
             total, pull = gram.sum(0), score.sum(0)
@@ -110,14 +113,14 @@ class Search:
                     + share.T @ gram[:, :k, :k] @ share)
         return gram, score, float(scan.chi2.sum())
 
-    def trials(self, fit):
+    def trials(self, fit, problem=None):
         """All options not yet in the hypothesis, best gain first; and the cluster sums of their columns."""
         options = [o for o in self.options if o.candidate not in fit.hypothesis.candidates]
         settings, where = [], []
         for option in options:
             where.append(range(len(settings), len(settings) + len(option.directions)))
             settings += [fit.hypothesis.plus(option.candidate, d).settings for d in option.directions]
-        gram, score, chi2 = self.reduced(fit, settings)
+        gram, score, chi2 = self.reduced(fit, settings, problem or self.problem)
         own = np.array([np.diag(g) for g in gram]).sum(0)
         out = []
         for option, mine in zip(options, where):
@@ -277,19 +280,105 @@ class Search:
                 return fit
             fit = less
 
-    def alternatives(self, fit, candidate, most=8):
-        """Refits with another effect in a candidate's place, lowest chi2 first: [(Fit, other candidate)]."""
-        [without] = shooting.solve(self.problem, [fit.hypothesis.minus(candidate)], fit, iterations=4)
-        trials, _, _, _ = self.trials(without)
-        best = next((t.gain for t in trials if t.option.candidate == candidate), trials[0].gain if trials else 0)
-        others, seen = [], set()
-        for t in trials:
-            if t.option.candidate != candidate and t.option.candidate not in seen and t.gain > 0.7 * best:
-                others.append(t)
-                seen.add(t.option.candidate)
-        others = others[:most]
-        if not others:
-            return []
-        fits = shooting.solve(self.small, [without.hypothesis.plus(t.option.candidate, t.start) for t in others],
-                              without.subset(self.few))
-        return sorted(zip(fits, (t.option.candidate for t in others)), key=lambda o: o[0].chi2.sum())
+    def settle(self, fit):
+        """Name every effect by the best that can stand in its place, the simplest where several do as well.
+
+        Returns (fit, {candidate: [(error ratio, candidate, values), ...]}): what else is possible, best first.
+        """
+        possible = {}
+        for candidate in fit.hypothesis.candidates:
+            small = fit.subset(self.few)
+            others, pair = self.alternatives(small, candidate)
+            if pair is not None:
+                [new] = shooting.solve(self.problem, [pair], fit, iterations=5)
+                added = [c for c in pair.candidates if c not in fit.hypothesis.candidates]
+                if (new.chi2.sum() < (1 - 2 * WORTH) * fit.chi2.sum()
+                        and max(self.significance(new, c)[0] for c in added) < ALPHA / self.places):
+                    fit = new
+                    possible.update({c: [] for c in added})
+                    continue
+            equals = [(small, candidate)] + [(f, c) for f, c in others if not self.worse(f, small)]
+            best, name = min(equals, key=lambda e: simplicity(e[1]))
+            better = [e for e in equals if self.worse(small, e[0])]
+            if better:
+                best, name = min(better, key=lambda e: e[0].chi2.sum())
+            if name != candidate:
+                [new] = shooting.solve(self.problem, [best.hypothesis], fit, iterations=5)
+                if new.chi2.sum() < (1 + WORTH) * fit.chi2.sum():
+                    others = [(small, candidate)] + [o for o in others if o[1] != name]
+                    fit, candidate = new, name
+                    small = fit.subset(self.few)
+            ratio = lambda f: float(np.sqrt(f.chi2.sum() / small.chi2.sum()))
+            listed = [(ratio(f), c, f.hypothesis.settings[c]) for f, c in others]
+            possible[candidate] = sorted((o for o in listed if o[0] < 1 + SAME), key=lambda o: (round(o[0], 2), simplicity(o[1])))
+        return fit, possible
+
+    def worse(self, one, other):
+        """Whether a fit's squared residual lies above another's by more than its scatter over windows (and 0.1 %)."""
+        gap = one.chi2 - other.chi2
+        return gap.sum() > max(2 * np.sqrt(len(gap)) * gap.std(), 1e-3 * other.chi2.sum())
+
+    def alternatives(self, small, candidate, most=5):
+        """What can stand in a candidate's place, on few windows: [(Fit, other candidate)], and a promising pair or None.
+
+        To first order: the residual that the effect's absence would leave, explained by the columns of others.
+        """
+        values = small.hypothesis.settings[candidate]
+        without = small.hypothesis.minus(candidate)
+        own = [{**s, candidate: values} for s in shooting.perturbed(without)[0]]
+        options = [o for o in self.options if o.candidate not in small.hypothesis.candidates]
+        tried = [small.hypothesis.plus(o.candidate, d).settings for o in options for d in o.directions]
+        slope = shooting.columns(self.small, [small], [own + [without.settings] + tried])[0]
+        scan = shooting.project(self.small, small, slope)
+        gram, k = scan.gram.sum(0), len(own)
+        score = scan.score.sum(0) - gram[:, k]  # of the residual without the effect
+        bare = scan.chi2.sum() - 2 * scan.score[:, k].sum() + gram[k, k]
+        base = list(range(k))
+
+        def left(columns):
+            """Squared residual once these columns and the other effects' have explained what they can; their amounts."""
+            columns = [c for c in base + columns if gram[c, c] > shooting.UNSEEN]
+            amount = scores.solve_small(gram[np.ix_(columns, columns)], score[columns])
+            return bare - score[columns] @ amount, dict(zip(columns, amount))
+
+        singles, at, alone = [], k + 1, left([])[0]
+        for option in options:
+            columns = list(range(at, at + len(option.directions)))
+            at += len(columns)
+            chi2, amount = left(columns)
+            start = self.start_of(option, columns, columns, [amount.get(c, 0.0) for c in columns])
+            if start is not None:
+                singles.append((chi2, option, columns, start))
+        singles.sort(key=lambda s: s[0])
+        now = scan.chi2.sum()
+        close, seen = [], set()
+        for chi2, option, _, start in singles:
+            if option.candidate not in seen and (chi2 < 1.5 * now or alone - chi2 > 0.97 * (alone - now)):
+                close.append((option, start))
+                seen.add(option.candidate)
+        close = close[:most]
+        hypotheses = [without.plus(option.candidate, start) for option, start in close]
+        pair = None
+        pairs = [(left(a[2] + b[2])[0], a, b) for i, a in enumerate(singles[:8]) for b in singles[i + 1:8] if a[1].candidate != b[1].candidate]
+        if pairs:
+            chi2, a, b = min(pairs, key=lambda p: p[0])
+            if chi2 < (1 - 2 * WORTH) * now:
+                amount = left(a[2] + b[2])[1]
+                starts = [self.start_of(o, c, c, [amount.get(i, 0.0) for i in c]) for _, o, c, _ in (a, b)]
+                if None not in starts:
+                    pair = without.plus(a[1].candidate, starts[0]).plus(b[1].candidate, starts[1])
+        fits = shooting.solve(self.small, hypotheses + ([pair] if pair else []), small, iterations=4)
+        if pair:
+            last = fits.pop()
+            pair = last.hypothesis if last.chi2.sum() < (1 - 2 * WORTH) * small.chi2.sum() else None
+        return [(f, option.candidate) for f, (option, _) in zip(fits, close)], pair
+
+
+# Of effects that the data cannot tell apart the first named here is preferred: what is most common, then simplest.
+COMMON = ("time_step", "viscous_damping", "coulomb_friction", "mass", "gain", "armature", "spring_offset", "stiffness", "bias", "delay",
+          "contact_friction", "quadratic_damping", "lag", "dead_zone", "saturation", "back_emf", "air_drag", "external_force", "gravity")
+
+
+def simplicity(candidate):
+    name = candidate.effect.name
+    return len(candidate.parameters), COMMON.index(name) if name in COMMON else len(COMMON)

@@ -218,6 +218,8 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
     warm: a Fit whose start states and start Jacobian begin every hypothesis, or a list of them. Parameters stay
     inside their bounds; a step is damped until the squared residual falls.
     """
+    if not hypotheses:
+        return []
     warm = warm if isinstance(warm, list) else [warm] * len(hypotheses)
     every = np.arange(len(problem.windows))
     number = len(every)
