@@ -185,8 +185,7 @@ class Real:
         data.xfrc_applied[:] = 0.0
         for item in self.forced:
             self._force(item, qvel, force)
-        for item in self.actuated:
-            self._motor_fault(item, drive, qvel, force)
+        self._motor_faults(drive, qvel, force)
         before = data.qvel.copy()
         if self.backlash is not None:
             self._couple(drive, force)
@@ -285,27 +284,29 @@ class Real:
         force = model.actuator_gainprm[index, 0] * drive[index] + bias[0] + bias[1] * length + bias[2] * velocity
         return force, velocity, gear, model.jnt_dofadr[joint]
 
-    def _motor_fault(self, item, drive, qvel, out):
-        """Adds the difference between the faulty actuator's force and the nominal one's."""
-        effect, p, index = item["effect"], item["parameters"], self._actuator(item)
+    def _motor_faults(self, drive, qvel, out):
+        """Adds the difference between the faulty actuators' forces and the nominal ones'."""
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:     # damps joints only
             qvel = self.data.qvel
-        force, velocity, gear, dof = self._law(index, drive, qvel)
-        if effect == "gain":
-            extra = (p["gain"] - 1.0) * force
-        elif effect == "fading_gain":
-            extra = -p["loss"] * (1 - np.exp(-self.data.time / p["seconds"])) * force
-        elif effect == "bias":
-            extra = p["bias"]
-        elif effect == "saturation":
-            extra = np.clip(force, -p["forcerange"], p["forcerange"]) - force
-        elif effect == "back_emf":
-            extra = -p["damping"] * velocity
-        elif effect == "dead_zone" and self.model.actuator_biasprm[index].any():
-            extra = -np.clip(force, -p["half_width"], p["half_width"])
-        else:
-            return
-        out[dof] += gear * extra
+        for index in {self._actuator(item) for item in self.actuated}:
+            nominal, velocity, gear, dof = self._law(index, drive, qvel)
+            faults = {item["effect"]: item["parameters"] for item in self.actuated if self._actuator(item) == index}
+            force = nominal                          # from the amplifier's input to its output
+            if "dead_zone" in faults and self.model.actuator_biasprm[index].any():
+                half = faults["dead_zone"]["half_width"]
+                force -= np.clip(force, -half, half)
+            if "gain" in faults:
+                force *= faults["gain"]["gain"]
+            if "fading_gain" in faults:
+                fading = faults["fading_gain"]
+                force *= 1 - fading["loss"] * (1 - np.exp(-self.data.time / fading["seconds"]))
+            if "bias" in faults:
+                force += faults["bias"]["bias"]
+            if "back_emf" in faults:
+                force -= faults["back_emf"]["damping"] * velocity
+            if "saturation" in faults:
+                force = np.clip(force, -faults["saturation"]["forcerange"], faults["saturation"]["forcerange"])
+            out[dof] += gear * (force - nominal)
 
     def _force(self, item, qvel, out):
         """Adds a hidden force to `out` (nv,), or to the bodies."""
