@@ -24,7 +24,7 @@ SIZES = (0.03, 0.1, 0.3)
 NOISES = (0.0003, 0.001)                             # rad or m per reading
 BLOCK = ("null",) * 13 + ("single",) * 24 + ("pair",) * 8 + ("unknown",) * 5
 NAMED = {"hopper_torso": ("hopper", "torso", 1.27), "cheetah_torso": ("half_cheetah", "torso", 1.15),
-         "heavy_pole": ("inverted_pendulum", "pole", 100 / 5.0185916)}
+         "heavy_pole": ("inverted_pendulum_firm", "pole", 100 / 5.0185916)}
 PAIRABLE = ("mass", "armature", "viscous_damping", "quadratic_damping", "coulomb_friction",
             "stiffness", "spring_offset", "gain", "bias", "delay", "lag", "saturation", "gravity",
             "sensor_bias", "link_length", "contact_friction", "external_force")
@@ -125,7 +125,7 @@ def _choose(seed, kind, nth, rng):
     deal = lambda cards: cards[int(np.random.default_rng((seed, nth // len(cards), len(cards)))
                                    .permutation(len(cards))[nth % len(cards)])]
     if kind == "null":
-        return deal(list(MECHANISMS)), []
+        return deal([name for name, mechanism in MECHANISMS.items() if mechanism.places]), []
     if kind == "unknown":
         effect, size = deal([(effect, size) for effect in UNKNOWNS for size in SIZES])
         mechanism = str(rng.choice(offers[effect]))
@@ -139,7 +139,7 @@ def _choose(seed, kind, nth, rng):
         mechanism = str(rng.choice(offers[effect]))
         return mechanism, [(effect, str(rng.choice(MECHANISMS[mechanism].places[effect])),
                             size * rng.uniform(0.8, 1.25))]
-    mechanism = str(rng.choice([name for name in MECHANISMS if name != "ball"]))
+    mechanism = str(rng.choice([name for name in MECHANISMS if "gain" in MECHANISMS[name].places]))
     places = MECHANISMS[mechanism].places
     effects = rng.choice([e for e in PAIRABLE if e in places], 2, replace=False)
     return mechanism, [(str(e), str(rng.choice(places[str(e)])),

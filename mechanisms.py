@@ -188,7 +188,7 @@ class Mechanism:
 
     interval: seconds between recorded rows; seconds: length of each recording; train, held_out:
     how many recordings; amplitude: of the open-loop control or, with gains, of the reference
-    followed; gains: (kp, kd) of the feedback per actuator; frequency: of the excitation, Hz;
+    followed; gains: (kp, kd) of the feedback, per actuator; frequency: of the excitation, Hz;
     places: {effect: names of joints, bodies, geoms or actuators}.
     """
 
@@ -219,7 +219,7 @@ class Mechanism:
             qvel[3:] = rng.uniform(-15, 15, 3)
         elif self.name == "slider":
             qpos[1] = rng.uniform(0.05, 0.3)
-        elif self.name == "inverted_pendulum":
+        elif self.name.startswith("inverted_pendulum"):
             qpos[1] = rng.uniform(-0.15, 0.15)
         elif self.name == "half_cheetah":
             qpos[:] += rng.uniform(-0.1, 0.1, model.nq)
@@ -237,8 +237,8 @@ class Mechanism:
         amplitude = np.asarray(self.amplitude) * rng.uniform(0.7, 1.2)
         if self.name == "hopper":
             law = stand_and_bounce(model, signal, amplitude)
-        elif self.name == "inverted_pendulum":
-            law = balance(signal, amplitude)
+        elif self.name.startswith("inverted_pendulum"):
+            law = balance(signal, amplitude, np.array(self.gains))
         elif self.gains is None:
             law = lambda t, qpos, qvel: amplitude * signal(t)
         else:
@@ -275,9 +275,8 @@ def excitation(rng, width, frequency):
     return lambda t: shape(t) * min(1.0, t / 0.3)
 
 
-def balance(signal, amplitude):
-    """Keeps the inverted pendulum's pole up, light or heavy, while the cart is shaken."""
-    gain = np.array([0.15, 15.0, 0.47, 3.9])         # found by random search
+def balance(signal, amplitude, gain):
+    """Keeps the inverted pendulum's pole up while the cart is shaken. gain: of x, angle, and their rates."""
     return lambda t, qpos, qvel: gain @ np.concatenate((qpos, qvel)) + amplitude * signal(t)
 
 
@@ -351,7 +350,10 @@ MECHANISMS = {mechanism.name: mechanism for mechanism in (
               xml=BALL, seconds=1.5, train=6, held_out=2),
     Mechanism("inverted_pendulum", _places(("slider", "hinge"), (), ("slide",), ("cart", "pole")),
               env=("InvertedPendulum-v4", "inverted_pendulum.xml"), interval=0.04, seconds=6.0,
-              train=1, amplitude=(0.15,), frequency=(0.2, 1.2)),
+              train=1, amplitude=(0.3,), gains=(0.2, 3.5, 0.4, 1.0), frequency=(0.2, 1.2)),
+    Mechanism("inverted_pendulum_firm", {},         # holds a pole of 100 kg, for that trial alone
+              env=("InvertedPendulum-v4", "inverted_pendulum.xml"), interval=0.04, seconds=6.0,
+              train=1, amplitude=(0.15,), gains=(0.15, 15.0, 0.47, 3.9), frequency=(0.2, 1.2)),
     Mechanism("hopper", _places(HOPPER_JOINTS, (), ("0", "1", "2"), HOPPER_BODIES, (),
                                 contact_friction=("foot_geom",), ground_height=("floor",)),
               env=("Hopper-v4", "hopper.xml"), interval=0.008, seconds=5.0, train=1,
