@@ -5,6 +5,7 @@ Everything here reads `Diagnosis.summary`, the dictionary that becomes diagnosis
 import math
 
 SPOKEN = {"coulomb": "Coulomb", "stribeck": "Stribeck", "back_emf": "back-EMF", "center_of_mass": "centre of mass"}
+ALWAYS_THERE = {"center_of_mass", "gravity", "ground_height", "link_length"}  # a nominal 0 of theirs is a value like any other
 SMALL = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}  # errors and noise are small: in these they read better
 
 
@@ -56,7 +57,7 @@ def finding_words(finding):
     parameters = finding["parameters"]
     if not parameters:
         return f"{place}: {effect}"
-    if all(parameter["nominal"] in (0, None) for parameter in parameters):
+    if parameters[0]["nominal"] in (0, None) and finding["effect"] not in ALWAYS_THERE:
         values = ", ".join((f"{p['name']} " if len(parameters) > 1 else "") + estimate(p) for p in parameters)
         sentence = f"{place}: {effect} {values} was left out"
     else:

@@ -196,6 +196,22 @@ def test_a_slide_in_millimetres(unit):
             check([one], model)
 
 
+def test_a_model_in_contact_is_not_accused():
+    """Resting on the floor, where the contact force is not known: no verdict on units or columns."""
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 .05">
+        <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size=".08 .08 .05" mass="1"/>
+        </body></worldbody><actuator><motor name="push" joint="x" gear="10"/><motor name="lift" joint="z" gear="10"/></actuator></mujoco>""")
+    rng = np.random.default_rng(0)
+    data, rows = mujoco.MjData(model), []
+    for k in range(2000):
+        data.ctrl[:] = 1.5 * np.sin(5 * data.time), 1.3 * np.sin(9 * data.time)
+        if k % 5 == 0:
+            rows.append([data.time, *(data.qpos + 1e-3 * rng.normal(size=2)), *data.ctrl])
+        mujoco.mj_step(model, data)
+    rows = np.array(rows)
+    check([Recording("run.csv", rows[:, 0], rows[:, 1:3], np.full((len(rows), 2), np.nan), rows[:, 3:])], model)
+
+
 # --- fuzzing: whatever stands in a file, it is a sound recording or one line ---
 
 def read_or_refuse(path, model):
