@@ -197,7 +197,7 @@ class Mechanism:
     xml: str | None = None
     env: tuple[str, str] | None = None              # gymnasium id, asset file
     interval: float = 0.01
-    seconds: float = 6.0
+    seconds: float = 4.0
     train: int = 3
     held_out: int = 1
     amplitude: tuple = ()
@@ -320,7 +320,7 @@ CHEETAH_JOINTS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 
 MECHANISMS = {mechanism.name: mechanism for mechanism in (
     Mechanism("pendulum", _places(("pivot",), ("pivot",), ("drive",), ("arm",)),
-              xml=PENDULUM, amplitude=(1.6,), seconds=7.0),
+              xml=PENDULUM, amplitude=(1.6,), seconds=5.0),
     Mechanism("cart_pole", _places(("rail", "hinge"), ("rail",), ("drive",), ("cart", "pole")),
               xml=CART_POLE, amplitude=(0.35,), gains=([3.0], [0.8])),
     Mechanism("arm2", _places(("shoulder", "elbow"), ("shoulder", "elbow"),
@@ -330,7 +330,7 @@ MECHANISMS = {mechanism.name: mechanism for mechanism in (
     Mechanism("servo_arm", _places(("yaw", "pitch", "elbow"), ("yaw", "pitch", "elbow"),
                                    ("yaw_servo", "pitch_servo", "elbow_servo"), ("upper", "fore"),
                                    ("fore",), backlash=("yaw", "elbow")),
-              xml=SERVO_ARM, amplitude=(0.8, 0.6, 0.8)),
+              xml=SERVO_ARM, amplitude=(0.8, 0.6, 0.8), train=2),
     Mechanism("furuta", _places(("arm", "pendulum"), ("arm",), ("drive",), ("pendulum",),
                                 ("pendulum",)),
               xml=FURUTA, amplitude=(0.8,), gains=([0.35], [0.05])),
@@ -347,7 +347,7 @@ MECHANISMS = {mechanism.name: mechanism for mechanism in (
     Mechanism("ball", dict.fromkeys(CONTACT_EFFECTS, ("ball",)) | {
                   "ground_height": ("floor",), "air_drag": ("world",), "wind": ("world",),
                   "gravity": ("world",), "time_step": ("world",), "external_force": ("ball",)},
-              xml=BALL, seconds=1.5, train=6, held_out=2),
+              xml=BALL, seconds=1.3, train=4, held_out=2),
     Mechanism("inverted_pendulum", _places(("slider", "hinge"), (), ("slide",), ("cart", "pole")),
               env=("InvertedPendulum-v4", "inverted_pendulum.xml"), interval=0.04, seconds=6.0,
               train=1, amplitude=(0.3,), gains=(0.2, 3.5, 0.4, 1.0), frequency=(0.2, 1.2)),
@@ -356,9 +356,9 @@ MECHANISMS = {mechanism.name: mechanism for mechanism in (
               train=1, amplitude=(0.15,), gains=(0.15, 15.0, 0.47, 3.9), frequency=(0.2, 1.2)),
     Mechanism("hopper", _places(HOPPER_JOINTS, (), ("0", "1", "2"), HOPPER_BODIES, (),
                                 contact_friction=("foot_geom",), ground_height=("floor",)),
-              env=("Hopper-v4", "hopper.xml"), interval=0.008, seconds=5.0, train=1,
+              env=("Hopper-v4", "hopper.xml"), interval=0.008, seconds=4.0, train=1,
               amplitude=(0.1, 0.2, 0.1), frequency=(0.5, 2.5)),
     Mechanism("half_cheetah", _places(CHEETAH_JOINTS, (), CHEETAH_JOINTS, ("torso", *CHEETAH_JOINTS)),
-              env=("HalfCheetah-v4", "half_cheetah.xml"), interval=0.05, seconds=10.0, train=1,
+              env=("HalfCheetah-v4", "half_cheetah.xml"), interval=0.05, seconds=8.0, train=1,
               amplitude=(0.5,) * 6, frequency=(0.5, 3.0)),
 )}
