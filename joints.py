@@ -147,11 +147,14 @@ class StribeckFriction(JointEffect):
         return released
 
     def write(self, spec, model, i, values):
-        # bristles as stiff as the time step can carry; damped, and so softer, where they would ring and explode
-        joint, per_step = model.joint(i).name, 1 / spec.option.timestep
-        stiffness, damping = (0.01, 0.1) if spec.option.integrator == int(mujoco.mjtIntegrator.mjINT_RK4) else (0.1, 0.0)
+        # bristles as stiff as the time step can carry
+        joint, h = model.joint(i).name, spec.option.timestep
         M = 1 / model.dof_invweight0[model.jnt_dofadr[i]]  # what the joint feels, its neighbours free
-        passive(spec, f'stribeck_friction:{joint}', JOINT_TRANSMISSION, joint, lugre=[stiffness * M * per_step**2, damping * M * per_step, *values])
+        stiffness, damping = 0.1 * M / h**2, 0.0
+        if spec.option.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):  # also explodes where they relax within a step
+            stiffness = min(0.01 * M / h**2, values[0] / (h * max(3.0, 10 * values[2])))
+            damping = np.sqrt(stiffness * M)
+        passive(spec, f'stribeck_friction:{joint}', JOINT_TRANSMISSION, joint, lugre=[stiffness, damping, *values])
         return 'mjcf'
 
 
@@ -219,7 +222,7 @@ class Cogging(JointEffect):
     def parameters(self, model, i):
         M = self.scale(model, i)
         return (Parameter('amplitude', self.unit(model, i, 'N·m', 'N'), 0.0, -HUGE * M, HUGE * M, 0.05 * M),
-                Parameter('poles', self.unit(model, i, '1', '1/m'), 6.0, 0.5, 1000.0, 0.1), Parameter('phase', 'rad', 0.0, -10.0, 10.0, 0.1))
+                Parameter('poles', self.unit(model, i, '1', 'rad/m'), 6.0, 0.1, 1e5, 0.1), Parameter('phase', 'rad', 0.0, -10.0, 10.0, 0.1))
 
     def probes(self, model, i, recordings):
         position, _ = self.travel(model, i, recordings)

@@ -139,9 +139,9 @@ class ExternalForce(Effect):
         xfrc[i, :3] += values
 
     def write(self, spec, model, i, values):
-        body = model.body(i).name
-        name, origin = f'external_force:{body}', f'external_force:{body}:world'
-        spec.body(body).add_site(name=name, pos=model.body_ipos[i])
+        body = spec.body(model.body(i).name)
+        name, origin = f'external_force:{body.name}', f'external_force:{body.name}:world'
+        body.add_site(name=name, pos=body.ipos if body.explicitinertial else model.body_ipos[i])
         spec.worldbody.add_site(name=origin)
         motor = constant_force(spec, name, 1.0, mujoco.mjtTrn.mjTRN_SITE, name)
         motor.refsite, motor.gear = origin, [*values, 0.0, 0.0, 0.0]
@@ -183,10 +183,14 @@ class SensorBias(SensorEffect):
         joint, offset = spec.joint(model.joint(i).name), angle(spec, model, i, values[0])
         joint.ref, joint.springref = joint.ref + offset, joint.springref + offset
         joint.range = [bound + offset for bound in joint.range]
-        for actuator in spec.actuators:  # a servo goes on controlling the true position
+        for actuator in spec.actuators:  # servos and magnets go on acting on the true position
             if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == joint.name:
-                actuator.type = mujoco.mjtActuator.mjACTUATOR_GENERAL
-                actuator.biasprm[0] -= actuator.biasprm[1] * actuator.gear[0] * values[0]
+                shift = actuator.gear[0] * values[0]
+                if actuator.biastype == mujoco.mjtBias.mjBIAS_DCMOTOR:
+                    actuator.biasprm[2] -= actuator.biasprm[1] * shift
+                elif actuator.biasprm[1]:
+                    actuator.type = mujoco.mjtActuator.mjACTUATOR_GENERAL
+                    actuator.biasprm[0] -= actuator.biasprm[1] * shift
         return 'mjcf'
 
 

@@ -53,20 +53,23 @@ class World:
 
     @classmethod
     def load(cls, path):
-        """The World of an MJCF file. ValueError, from MuJoCo, if it does not compile."""
-        with quiet():
-            spec = mujoco.MjSpec.from_file(str(path))
-        return cls(spec, Path(path).name)
+        """The World of an MJCF file. ValueError, of one line, if it does not compile."""
+        try:
+            with quiet():
+                spec = mujoco.MjSpec.from_file(str(path))
+            return cls(spec, Path(path).name)
+        except ValueError as error:
+            raise ValueError(' '.join(str(error).split())) from None
 
     @classmethod
     def from_env(cls, env_id):
         """The World of a gymnasium MuJoCo environment's model file. ValueError if it has none."""
         import gymnasium  # only here: a user with an MJCF file does not need it
         try:
-            with quiet(), warnings.catch_warnings(action='ignore'):  # an old version of an environment is what was asked for
+            with quiet():  # an old version of an environment is what was asked for
                 env = gymnasium.make(env_id)
         except gymnasium.error.Error as error:
-            raise ValueError(str(error)) from None
+            raise ValueError(' '.join(str(error).split())) from None
         try:
             path = getattr(env.unwrapped, 'fullpath', None)
         finally:
@@ -205,6 +208,7 @@ def quiet():
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
-        yield
+        with warnings.catch_warnings(action='ignore'):
+            yield
     finally:
         mujoco.set_mju_user_warning(before)
