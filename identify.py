@@ -25,6 +25,7 @@ from recordings import RecordingError
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
 FINAL_STEPS = 30000
 LEAST_ROWS = 8  # of a window
+SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
@@ -132,8 +133,9 @@ def span_for(world, train, position_noise, velocity_noise, hypothesis, at_least=
     sample = np.median([np.median(np.diff(r.time)) for r in train])
     duration = np.median([np.ptp(r.time) for r in train])
     shortest = max(LEAST_ROWS * sample, at_least)
-    whole = 1.0 if duration < 60 * sample else 0.5
-    longest = max(shortest, min(max(LONGEST, 40 * sample), whole * duration))
+    if duration < 60 * sample:  # too short to be cut
+        return float(duration)
+    longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration))
 
     def followed(span):
         problem = problem_of(world, train, position_noise, velocity_noise, span, SEARCH_STEPS / 4)
@@ -207,7 +209,7 @@ def assemble(world, train, held_out, fit, search, possible, ranking, position_no
             "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
                          "p_value": search.significance(fit, candidate)[0]},
             "depends_on": depends_on(candidate), "when": None, "written_as": written[candidate],
-            "also_possible": also_possible(possible[candidate])})
+            "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible[candidate])})
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
                "held_out": figure(world, settings, held, position_noise, velocity_noise)}
@@ -249,8 +251,16 @@ def depends_on(candidate):
         candidate.effect, "depends_on") else []
 
 
-def also_possible(others, most=3):
-    return [{"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, values)} for _, c, values in others[:most]]
+def also_possible(world, train, noise, hypothesis, candidate, others, most=3):
+    """The alternatives that leave the reported error, on the data they were fitted to, within 5 % of the finding's."""
+    windows = evidence.consecutive(train, cut.HORIZON)
+    windows = windows[:: -(-len(windows) // 60)]
+    rms = lambda settings: cut.error(world.model, windows, evidence.predict(world, settings, windows)[0], noise)[0]
+    out, best = [], rms(hypothesis.settings) if others else 0.0
+    for _, other, values in others:
+        if len(out) < most and rms(hypothesis.minus(candidate).plus(other, values).settings) < (1 + SAME) * best:
+            out.append({"effect": other.effect.name, "place": place_of(other), "parameters": parameters_of(other, values)})
+    return out
 
 
 def ranking_rows(trials, fit):

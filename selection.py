@@ -19,7 +19,6 @@ from probes import values_to_try
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 WORTH = 0.03  # least fall of the squared residual, of what is there, that an effect must bring
 FEW = 16  # windows, at least, of a refit that only has to tell hypotheses apart
-SAME = 0.05  # effects whose refits differ by less than this in error cannot be told apart
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,10 @@ class Trial:
     gain: float
     p_value: float
     held: float
-    start: tuple
-    columns: list  # of the scan
+    start: tuple  # None where the estimate points out of the bounds
+    columns: list  # of the scan, the first of the option at `where`
+    where: range
+    value: np.ndarray
     chi2: float  # before
 
 
@@ -129,10 +130,7 @@ class Search:
                 continue
             pick = np.ix_(range(len(gram)), columns, columns)
             value, gain, p, held = scores.wald(gram[pick], score[:, columns])
-            start = self.start_of(option, columns, mine, value)
-            if start is None:
-                continue
-            out.append(Trial(option, gain, p, float(held.sum()), start, columns, chi2))
+            out.append(Trial(option, gain, p, float(held.sum()), self.start_of(option, columns, mine, value), columns, mine, value, chi2))
         out.sort(key=lambda t: -t.gain)
         return out, gram, score, chi2
 
@@ -149,18 +147,38 @@ class Search:
             return None
         return tuple(start)
 
-    def pairs(self, trials, gram, score, among=10):
-        """Gains of pairs of options, best first: [(gain, trial, trial)]. One of the two is among the best singles."""
-        total, pull, out = gram.sum(0), score.sum(0), []
-        for i, a in enumerate(trials[:among]):
-            for b in trials[i + 1:]:
-                if b.option.candidate == a.option.candidate:
-                    continue
-                columns = a.columns + b.columns
-                block = total[np.ix_(columns, columns)]
-                gain = float(pull[columns] @ scores.solve_small(block, pull[columns]))
-                out.append((gain, a, b))
-        out.sort(key=lambda t: -t[0])
+    def pairs(self, trials, gram, score, most=2):
+        """The best pairs of options, each as [gain, (candidate, start), (candidate, start)]; no two of them alike.
+
+        An option of several columns takes part with their best single combination.
+        """
+        total, pull = gram.sum(0), score.sum(0)
+        mix = np.zeros((len(total), len(trials)))
+        for i, t in enumerate(trials):
+            mix[t.columns, i] = t.value
+        size = np.sqrt(np.maximum(np.einsum("ki,kl,li->i", mix, total, mix), 1e-300))
+        near, push = mix.T @ total @ mix / size / size[:, None], mix.T @ pull / size
+        apart = np.maximum(1 - near**2, 1e-300)
+        gains = (push[:, None] ** 2 - 2 * near * np.outer(push, push) + push**2) / apart
+        same = np.array([[a.option.candidate == b.option.candidate for b in trials] for a in trials])
+        gains[same | (apart < 1e-3)] = -np.inf
+        out, used = [], []
+        for flat in np.argsort(-gains, axis=None)[: 20 * most]:
+            i, j = np.unravel_index(flat, gains.shape)
+            if i >= j or not np.isfinite(gains[i, j]):
+                continue
+            if any({k for k in (i, j)} <= {m for m in range(len(trials)) if np.abs(near[m, u]).max() > 0.99} for u in used):
+                continue
+            amounts = np.array([push[i] - near[i, j] * push[j], push[j] - near[i, j] * push[i]]) / apart[i, j] / size[[i, j]]
+            pair = []
+            for k, amount in zip((i, j), amounts):
+                t = trials[k]
+                pair.append((t.option.candidate, self.start_of(t.option, t.columns, t.where, amount * np.asarray(t.value))))
+            if all(start is not None for _, start in pair):
+                out.append([float(gains[i, j]), *pair])
+                used.append([i, j])
+            if len(out) == most:
+                break
         return out
 
     # ---- nonlinear search ----------------------------------------------------------------------
@@ -173,19 +191,17 @@ class Search:
             if not self.ranking:
                 self.ranking = trials
             level = ALPHA / self.places
-            hopeful = [t for t in trials if t.p_value < 10 * level and t.held > 0 and t.gain > 0.3 * WORTH * chi2]
-            proposals = [(t,) for t in self.spread(hopeful, gram, singles)]
-            best = trials[0].gain if trials else 0.0
-            proposals += [(a, b) for gain, a, b in self.pairs(trials, gram, score)[:doubles]
-                          if gain > best + max(WORTH * chi2, 0.1 * best)]
+            hopeful = [t for t in trials if t.start and t.p_value < 10 * level and t.held > 0 and t.gain > 0.3 * WORTH * chi2]
+            proposals = [[(t.option.candidate, t.start)] for t in self.spread(hopeful, gram, singles)]
+            best = max((t.gain for t in trials if t.start), default=0.0)
+            proposals += [list(pair) for gain, *pair in self.pairs(trials, gram, score, doubles)
+                          if gain > best + max(2 * WORTH * chi2, 0.1 * best)]
             if not proposals:
                 break
-            hypotheses = []
-            for proposal in proposals:
-                h = fit.hypothesis
-                for t in proposal:
-                    h = h.plus(t.option.candidate, t.start)
-                hypotheses.append(h)
+            hypotheses = [fit.hypothesis for _ in proposals]
+            for i, proposal in enumerate(proposals):
+                for candidate, start in proposal:
+                    hypotheses[i] = hypotheses[i].plus(candidate, start)
             self.progress(f"refitting {len(hypotheses)} hypotheses")
             fits = shooting.solve(self.small, hypotheses, fit.subset(self.few), iterations=4)
             chosen = self.choose(fit, fits, proposals)
@@ -256,7 +272,7 @@ class Search:
                 order.remove(single)
                 order.insert(0, single)
         for i in order[:3]:
-            added = tuple(t.option.candidate for t in proposals[i])
+            added = tuple(candidate for candidate, _ in proposals[i])
             if 1 - fits[i].chi2.sum() / before < 0.5 * WORTH * len(added):
                 continue
             [new] = shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4)
@@ -310,15 +326,23 @@ class Search:
                     small = fit.subset(self.few)
             ratio = lambda f: float(np.sqrt(f.chi2.sum() / small.chi2.sum()))
             listed = [(ratio(f), c, f.hypothesis.settings[c]) for f, c in others]
-            possible[candidate] = sorted((o for o in listed if o[0] < 1 + SAME), key=lambda o: (round(o[0], 2), simplicity(o[1])))
+            possible[candidate] = sorted(listed, key=lambda o: (round(o[0], 2), simplicity(o[1])))
         return fit, possible
 
     def worse(self, one, other):
-        """Whether a fit's squared residual lies above another's by more than its scatter over windows (and 0.1 %)."""
-        gap = one.chi2 - other.chi2
-        return gap.sum() > max(2 * np.sqrt(len(gap)) * gap.std(), 1e-3 * other.chi2.sum())
+        """Whether a fit's squared residual (few windows) lies above another's beyond its scatter between clusters."""
+        gap = scores.summed(self.few_labels, self.pieced(one) - self.pieced(other))
+        scatter = scores.t_quantile(max(len(gap) - 1, 1)) * np.sqrt(len(gap)) * gap.std(ddof=1 if len(gap) > 1 else 0)
+        return gap.sum() > max(scatter, 1e-3 * other.chi2.sum())
 
-    def alternatives(self, small, candidate, most=5):
+    def pieced(self, fit):
+        """Squared residual of a fit's windows in pieces, (W * pieces,)."""
+        rows, width = self.problem.weight.shape[1:]
+        square = (fit.residual[:, :rows * width] ** 2).reshape(-1, rows, width).sum(-1)
+        owner = np.arange(rows) * self.pieces // rows
+        return np.stack([square[:, owner == i].sum(1) for i in range(self.pieces)], 1).ravel()
+
+    def alternatives(self, small, candidate, most=6):
         """What can stand in a candidate's place, on few windows: [(Fit, other candidate)], and a promising pair or None.
 
         To first order: the residual that the effect's absence would leave, explained by the columns of others.
@@ -353,7 +377,7 @@ class Search:
         now = scan.chi2.sum()
         close, seen = [], set()
         for chi2, option, _, start in singles:
-            if option.candidate not in seen and (chi2 < 1.5 * now or alone - chi2 > 0.97 * (alone - now)):
+            if option.candidate not in seen and (chi2 < 1.5 * now or alone - chi2 > 0.9 * (alone - now)):
                 close.append((option, start))
                 seen.add(option.candidate)
         close = close[:most]
