@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 GEOM, JOINT = mujoco.mjtGeom, mujoco.mjtJoint
-CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 20, endpoint=False)),
-                   np.sin(np.linspace(0, 2 * np.pi, 20, endpoint=False))], axis=1)
+CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False)),
+                   np.sin(np.linspace(0, 2 * np.pi, 24, endpoint=False))], axis=1)
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 
 
@@ -45,7 +45,7 @@ def outlines(model, qpos, axes, towards):
     data = _posed(model, qpos)
     found = []
     for g in range(model.ngeom):
-        kind, size, centre = model.geom_type[g], model.geom_size[g], data.geom_xpos[g]
+        kind, size, centre = GEOM(model.geom_type[g]), model.geom_size[g], data.geom_xpos[g]
         frame = data.geom_xmat[g].reshape(3, 3)
         if kind in (GEOM.mjGEOM_PLANE, GEOM.mjGEOM_HFIELD) or model.geom_rgba[g, 3] == 0 and model.geom_matid[g] < 0:
             continue
@@ -55,7 +55,7 @@ def outlines(model, qpos, axes, towards):
         elif kind == GEOM.mjGEOM_CAPSULE:
             points = np.concatenate([centre + ring + end * size[1] * frame[:, 2] for end in (-1, 1)])
         elif kind == GEOM.mjGEOM_CYLINDER:
-            flat = np.concatenate([np.column_stack([size[0] * CIRCLE, np.full(20, end * size[1])]) for end in (-1, 1)])
+            flat = np.concatenate([np.column_stack([size[0] * CIRCLE, np.full(24, end * size[1])]) for end in (-1, 1)])
             points = centre + flat @ frame.T
         elif kind == GEOM.mjGEOM_ELLIPSOID:
             body = frame * size  # columns: half axes; the outline is where the normal is square to the view
@@ -100,7 +100,7 @@ def marked(model, place):
         joint = _id(model.joint, name)
     elif kind == "actuator":
         actuator = _id(model.actuator, name)
-        if actuator is not None and model.actuator_trntype[actuator] in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        if actuator is not None and mujoco.mjtTrn(model.actuator_trntype[actuator]) in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
             joint = int(model.actuator_trnid[actuator, 0])
     elif kind == "sensor":
         sensor = _id(model.sensor, name)
@@ -108,7 +108,9 @@ def marked(model, place):
             joint = int(model.sensor_objid[sensor])
     elif kind == "geom":
         geom = _id(model.geom, name)
-        return ([] if geom is None else [geom]), (None if geom is None else lambda data: data.geom_xpos[geom])
+        if geom is None:
+            return [], None
+        return [geom], lambda data: _under(model, data, geom) if GEOM(model.geom_type[geom]) == GEOM.mjGEOM_PLANE else data.geom_xpos[geom]
     elif kind == "body":
         body = _id(model.body, name)
         if body is not None:
@@ -128,13 +130,14 @@ def _id(named, name):
 
 
 class Paper:
-    """World coordinates on paper to SVG pixels: fits boxes (n, 2) into width x height with a margin."""
+    """World coordinates on paper to SVG pixels: fits points (n, 2) into `width` and at most `height`, with a margin."""
 
-    def __init__(self, points, width, height, margin=28):
+    def __init__(self, points, width, height, margin):
         low, high = points.min(axis=0), points.max(axis=0)
         size = np.maximum(high - low, 1e-6 + 0.02 * (high - low).max())
         self.scale = min((width - 2 * margin) / size[0], (height - 2 * margin) / size[1])
-        self.middle, self.centre = (low + high) / 2, np.array([width / 2, height / 2])
+        self.width, self.height = width, int(min(height, max(0.45 * height, self.scale * size[1] + 2 * margin)))
+        self.middle, self.centre = (low + high) / 2, np.array([width, self.height]) / 2
 
     def __call__(self, points):
         return self.centre + (np.asarray(points) - self.middle) * self.scale * [1, -1]
@@ -157,6 +160,7 @@ def mechanism(model, poses, places, labels, width=380, height=300):
     size = np.ptp(first, axis=0).max()
     ghosts = [ghost for ghost in drawn[1:] if ghost and np.ptp(np.concatenate([first] + [p for _, p, _ in ghost]), axis=0).max() < 3 * size]
     paper = Paper(np.concatenate([first] + [p for ghost in ghosts for _, p, _ in ghost]), width, height, 40)
+    height = paper.height
     coloured, points = set(), []
     for place in places:
         geoms, where = marked(model, place)
@@ -192,7 +196,7 @@ def mechanism(model, poses, places, labels, width=380, height=300):
 
 
 def _ground(model, data, axes, towards, paper, width, height, coloured):
-    """Planes: a line where seen edge-on, else a faint sheet."""
+    """Planes: a line where seen edge-on, else a sheet."""
     parts = []
     for g in np.flatnonzero(model.geom_type == int(GEOM.mjGEOM_PLANE)):
         frame, centre = data.geom_xmat[g].reshape(3, 3), data.geom_xpos[g]
@@ -201,13 +205,17 @@ def _ground(model, data, axes, towards, paper, width, height, coloured):
             along = axes @ np.cross(frame[:, 2], towards)
             a, b = paper(axes @ centre - 1e3 / paper.scale * along), paper(axes @ centre + 1e3 / paper.scale * along)
             parts.append(f'<path class="ground{bad}" d="M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}"/>')
-        else:
-            reach = 0.5 * min(width, height) / paper.scale
-            # the sheet lies under the drawing's middle, not at the plane's own centre, which can be far away
-            middle = paper.middle @ axes + towards * ((centre - paper.middle @ axes) @ frame[:, 2]) / (towards @ frame[:, 2])
+        elif abs(frame[:, 2] @ towards) < 0.95:  # face-on it would only be a background
+            reach, middle = 0.4 * width / paper.scale, _under(model, data, g)
             corners = [middle + reach * (x * frame[:, 0] + y * frame[:, 1]) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
             parts.append(f'<path class="sheet{bad}" d="{_path(paper(np.array(corners) @ axes.T))}"/>')
     return parts
+
+
+def _under(model, data, plane):
+    """(3,) the point of a plane beneath the mechanism: its own centre can be far away."""
+    normal, middle = data.geom_xmat[plane].reshape(3, 3)[:, 2], data.xipos[1:].mean(axis=0)
+    return middle - ((middle - data.geom_xpos[plane]) @ normal) * normal
 
 
 def _links(model, data, axes, paper):
@@ -229,9 +237,10 @@ def _links(model, data, axes, paper):
 def _joint(model, data, j, axes, towards, paper):
     """A hinge as a small ring, a slide as a double arrow along its axis."""
     x, y = paper(axes @ data.xanchor[j])
-    if model.jnt_type[j] in (int(JOINT.mjJNT_HINGE), int(JOINT.mjJNT_BALL)):
+    kind = JOINT(model.jnt_type[j])
+    if kind in (JOINT.mjJNT_HINGE, JOINT.mjJNT_BALL):
         return f'<circle class="hinge" cx="{x:.1f}" cy="{y:.1f}" r="3.5"/>'
-    if model.jnt_type[j] == int(JOINT.mjJNT_SLIDE):
+    if kind == JOINT.mjJNT_SLIDE:
         direction = axes @ data.xaxis[j] * [1, -1]
         length = np.linalg.norm(direction)
         if length < 0.2:
@@ -257,6 +266,7 @@ def animation(model, motions, seconds, width=380, height=300):
     low, high = recorded.min(axis=0), recorded.max(axis=0)
     reach = 0.6 * (high - low).max()  # a simulation that runs away leaves the picture instead of shrinking it
     paper = Paper(np.clip(everything, low - reach, high + reach), width, height, 20)
+    height = paper.height
     paths = {look: ["".join("M" + "L".join(f"{x:.0f} {y:.0f}" for x, y in paper(outline)) + "Z" for _, outline, _ in frame)
                     for frame in motion] for look, motion in drawn.items()}
     data = _posed(model, frames["measured"][0])

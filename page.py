@@ -55,13 +55,13 @@ th{color:var(--soft);font-weight:500}
 .bar{display:inline-block;width:90px;height:9px;background:var(--rule);border-radius:5px;overflow:hidden;margin-right:6px}
 .bar i{display:block;height:100%;background:var(--corrected)}
 .part{fill:var(--part);stroke:var(--edge);stroke-width:1.2;stroke-linejoin:round}
-.part.bad,.sheet.bad{fill:var(--bad);fill-opacity:.75;stroke:var(--bad)}
+.part.bad{fill:var(--bad);fill-opacity:.75;stroke:var(--bad)}
 .ghost{opacity:.16}
 .link{stroke:var(--edge);stroke-width:2}
 .hinge{fill:var(--paper);stroke:var(--edge);stroke-width:1.6}
 .slide{fill:none;stroke:var(--edge);stroke-width:1.6}
 .ground{stroke:var(--edge);stroke-width:2}.ground.bad{stroke:var(--bad);stroke-width:4}
-.sheet{fill:var(--rule);fill-opacity:.45;stroke:none}
+.sheet{fill:var(--rule);fill-opacity:.6;stroke:none}.sheet.bad{fill:var(--bad);fill-opacity:.3;stroke:var(--bad)}
 .badmark{fill:none;stroke:var(--bad);stroke-width:3}
 .leader{stroke:var(--bad);stroke-width:1.2;fill:none}
 svg .badlabel{fill:var(--bad);font-size:12px;font-weight:600;paint-order:stroke;stroke:var(--paper);stroke-width:3px}

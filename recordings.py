@@ -237,10 +237,10 @@ def _check_values(recording, model, warn):
         if kind == "ctrl" and limited and (low < span[0] - 1e-3 * np.ptp(span) or high > span[1] + 1e-3 * np.ptp(span)):
             warn(recording, f"{column} leaves the model's ctrlrange {span[0]:g} to {span[1]:g}; MuJoCo clips it there")
         kept = {edge: np.count_nonzero((values[1:] == edge) & (values[:-1] == edge)) / rows for edge in (low, high)}
-        switched = kept[low] + kept[high] > 0.8  # a square wave is not saturation
+        switched = kept[low] + kept[high] > 0.95  # a square wave is not saturation
         for edge, share in kept.items():
             at_range = kind == "ctrl" and limited and abs(edge - span[int(edge == high)]) < 1e-6 * (1 + abs(edge))
-            if share > 0.03 and (at_range or not switched and (edge if kind == "qpos" else low == -high)):
+            if share > 0.03 and not switched and (at_range or (edge if kind == "qpos" else low == -high)):
                 warn(recording, f"{column} stays at its extreme {edge:g} in {100 * share:.0f} % of the rows: "
                      + ("saturated at ctrlrange" if at_range else "saturated" if kind == "ctrl" else "clipped, or at a stop"))
 

@@ -119,7 +119,7 @@ def _head(summary, title):
     fit = summary["fit"]["held_out"]
     steps = "".join(f'<div class="{look}"><b>{E(wording.number(fit[key], 2))}</b><span>{words}</span></div>'
                     for key, look, words in (("before", "nominal", "nominal model"), ("after", "corrected", "corrected model"),
-                                             ("floor", "noise", "sensors’ noise")) if fit.get(key) is not None)
+                                             ("floor", "noise", "noise alone")) if fit.get(key) is not None)
     left = wording.unexplained_words(summary)
     return (f'<header><p class="kicker">{E(title)}</p><h1 class="{summary["verdict"]}">{E(wording.verdict_words(summary))}</h1>'
             f'{f"<ol class=verdict>{findings}</ol>" if findings else ""}'

@@ -94,7 +94,7 @@ def depends_words(depends_on):
 
 
 def error_words(summary):
-    """"held-out error falls from 31 to 2 mrad at elbow; the sensors' noise is 1 mrad" (0.3 s ahead)."""
+    """"held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; the sensors' noise alone makes 1 mrad"."""
     fit = summary["fit"]["held_out"]
     ahead = f"{fit.get('horizon_s', 0.3):g} s ahead"
     channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"] and c["before"] is not None}
@@ -108,8 +108,8 @@ def error_words(summary):
     else:
         before, after, floor, unit, place = *(number(fit[key], 2) for key in ("before", "after", "floor")), "times the noise", ""
     if summary["verdict"] == "match":
-        return f"held-out error {ahead} is {before} {unit}{place}; the sensors' noise is {floor} {unit}"
-    return f"held-out error {ahead} falls from {before} to {after} {unit}{place}; the sensors' noise is {floor} {unit}"
+        return f"held-out error {ahead} is {before} {unit}{place}; the sensors' noise alone makes {floor} {unit}"
+    return f"held-out error {ahead} falls from {before} to {after} {unit}{place}; the sensors' noise alone makes {floor} {unit}"
 
 
 def unexplained_words(summary):

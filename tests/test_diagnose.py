@@ -167,7 +167,7 @@ def test_error_in_words():
            "channels": {"qpos:a": {"before": 0.002, "after": 0.002, "floor": 0.001, "unit": "rad"},
                         "qpos:elbow": {"before": 0.031, "after": 0.002, "floor": 0.001, "unit": "rad"}}}
     summary = {"verdict": "mismatch", "fit": {"held_out": fit}}
-    assert wording.error_words(summary) == "held-out error 0.3 s ahead falls from 31 to 2.0 mrad at elbow; the sensors' noise is 1.0 mrad"
+    assert wording.error_words(summary) == "held-out error 0.3 s ahead falls from 31 to 2.0 mrad at elbow; the sensors' noise alone makes 1.0 mrad"
     del fit["channels"]
     assert "falls from 31 to 2.0 times the noise" in wording.error_words(summary)
 
