@@ -13,7 +13,6 @@ import argparse
 import dataclasses
 import os
 import sys
-import warnings
 
 import gymnasium
 import mujoco
@@ -24,7 +23,7 @@ import recordings as recorded
 import report
 import wording
 from identify import identify
-from world import World
+from world import World, quiet
 
 
 class ModelError(ValueError):
@@ -153,18 +152,16 @@ def main(argv=None):
         bar.set_description(what, refresh=False)
         bar.update(max(0, min(1, fraction) - bar.n))
 
-    mujoco.set_mju_user_warning(lambda message: None)  # else MuJoCo leaves a MUJOCO_LOG.TXT in the working folder
     try:
         args = parser.parse_args(argv)
         if args.model is not None and not os.path.isfile(args.model):
             raise ModelError(f"{args.model}: no such model file; check the path")
         report.check_folder(args.out)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # gymnasium on old versions of environments
+        with quiet():
             if sys.stderr.isatty():
                 bar = tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", file=sys.stderr)
             diagnosis = diagnose(args.model or args.env, args.recordings, args.held_out, progress if bar is not None else None)
-        report.write(diagnosis, args.out)
+            report.write(diagnosis, args.out)
     except (recorded.RecordingError, ModelError, report.ReportError, mujoco.FatalError, MemoryError) as error:
         if bar is not None:
             bar.close()
