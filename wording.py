@@ -43,6 +43,9 @@ def estimate(parameter):
     decimals = max(0, (half < 2.95 * 10.0 ** math.floor(math.log10(half))) - math.floor(math.log10(half)))  # 0.12 but 0.4
     if decimals > 9 or half > 1e6:
         return f"{number(value)} ({number(low)} to {number(high)}){unit}"
+    most = max(0, 3 - math.floor(math.log10(abs(value)))) if value else decimals
+    if decimals > most:  # four digits of a value are enough, however narrow its interval
+        return f"{value:.{most}f} ± {number(half, 1)}{unit}"
     if abs(value - (low + high) / 2) < 0.25 * half:
         return f"{value:.{decimals}f} ± {half:.{decimals}f}{unit}"
     return f"{value:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f}){unit}"
