@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from effects import HUGE, JOINT_TRANSMISSION, Effect, Parameter, catalogue, turns
+from effects import HUGE, JOINT_TRANSMISSION, Effect, Parameter, catalogue, constant_force, turns
 
 
 class ActuatorEffect(Effect):
@@ -242,6 +242,25 @@ class DeadZone(ActuatorEffect):
         return absorbed
 
     def write(self, spec, model, i, values):
-        return 'none'
-
-
+        """For a motor on a joint: it turns a light wheel against a spring of its own instead, and a tendon whose
+        spring has a dead band hands on what is beyond it, about half a time step later, once it is wound up."""
+        motor = spec.actuator(model.actuator(i).name)
+        if model.actuator_trntype[i] != JOINT_TRANSMISSION or motor.biasprm[1:3].any() or motor.dyntype != mujoco.mjtDyn.mjDYN_NONE:
+            return 'none'
+        h, gain, gear, joint, name = spec.option.timestep, abs(motor.gainprm[0]), motor.gear[0], motor.target, f'dead_zone:{motor.name}'
+        k = 1e-3 * self.strength(model, i)  # so soft that it travels far, and the joint's own travel adds nothing
+        inertia = max(0.5 * k * h**2, 1e-13)  # MuJoCo refuses less than 1e-15
+        body = spec.worldbody.add_body(name=name, mass=1.0, ipos=[0.0] * 3, inertia=[inertia] * 3, explicitinertial=True)  # too dense for air to matter
+        wheel = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, stiffness=[k, 0.0, 0.0], damping=[k * h, 0.0, 0.0])
+        wheel.limited, wheel.armature, wheel.frictionloss, wheel.ref, wheel.springref = mujoco.mjtLimited.mjLIMITED_FALSE, 0.0, 0.0, 0.0, 0.0
+        edge = gain * values[0] / k
+        tendon = spec.add_tendon(name=name, stiffness=[k, 0.0, 0.0], springlength=[-edge, edge])
+        tendon.wrap_joint(name, 1.0)
+        tendon.wrap_joint(joint, -2 * gear)
+        motor.target, motor.gear = name, [1.0, *motor.gear[1:]]
+        if motor.biasprm[0]:  # stays outside
+            constant_force(spec, f'{name}:bias', gear * motor.biasprm[0], JOINT_TRANSMISSION, joint)
+            motor.biasprm[0] = 0.0
+        if any(motor.forcerange):
+            motor.forcerange = np.array(motor.forcerange) + gain * values[0] * np.array([-1, 1])
+        return 'mjcf'

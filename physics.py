@@ -5,7 +5,7 @@
 Joints, actuators and surroundings have their effects in modules of their own.
 """
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -17,19 +17,16 @@ from effects import EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, P
 
 
 def explicit_inertia(spec, model):
-    """Make every inertia of spec explicit, as compiled: what geoms imply cannot be edited."""
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-    spec.compiler.settotalmass, spec.compiler.balanceinertia = -1, False
+    """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot be edited."""
+    compiler, on = spec.compiler, mujoco.mjtInertiaFromGeom
+    implied = compiler.inertiafromgeom == on.mjINERTIAFROMGEOM_TRUE or compiler.settotalmass > 0  # even over what the file says
+    compiler.inertiafromgeom, compiler.settotalmass, compiler.balanceinertia = on.mjINERTIAFROMGEOM_AUTO, -1, False
     for body in spec.bodies[1:]:
-        if not body.explicitinertial or np.isfinite(body.fullinertia[0]):
-            _write_inertia(body, model)
-
-
-def _write_inertia(body, model):
-    i = model.body(body.name).id
-    body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
-    body.mass, body.ipos, body.inertia = model.body_mass[i], model.body_ipos[i], model.body_inertia[i]
-    body.ialt.type, body.iquat = mujoco.mjtOrientation.mjORIENTATION_QUAT, model.body_iquat[i]
+        if (implied or not body.explicitinertial or np.isfinite(body.fullinertia[0])) and model.body(body.name).mass[0] > 0:
+            i = model.body(body.name).id
+            body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
+            body.mass, body.ipos, body.inertia = model.body_mass[i], model.body_ipos[i], model.body_inertia[i]
+            body.ialt.type, body.iquat = mujoco.mjtOrientation.mjORIENTATION_QUAT, model.body_iquat[i]
 
 
 class InertialEffect(Effect):
@@ -42,19 +39,11 @@ class InertialEffect(Effect):
 
     def write(self, spec, model, i, values):
         explicit_inertia(spec, model)
-        body, edited = spec.body(model.body(i).name), _Inertia(body_mass=model.body_mass.copy(), body_ipos=model.body_ipos.copy(), body_inertia=model.body_inertia.copy())
-        edited.body_mass[i], edited.body_ipos[i], edited.body_inertia[i] = body.mass, body.ipos, body.inertia
-        self.edit(edited, i, values)
-        body.mass, body.ipos, body.inertia = edited.body_mass[i], edited.body_ipos[i], edited.body_inertia[i]
+        body = spec.body(model.body(i).name)
+        alone = SimpleNamespace(body_mass=np.array([body.mass]), body_ipos=np.array([body.ipos]), body_inertia=np.array([body.inertia]))
+        self.edit(alone, 0, values)
+        body.mass, body.ipos, body.inertia = alone.body_mass[0], alone.body_ipos[0], alone.body_inertia[0]
         return 'mjcf'
-
-
-@dataclass
-class _Inertia:
-    """The part of a model that InertialEffect effects edit."""
-    body_mass: np.ndarray
-    body_ipos: np.ndarray
-    body_inertia: np.ndarray
 
 
 @catalogue
