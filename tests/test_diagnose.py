@@ -151,7 +151,7 @@ def finding(effect, kind, name, *parameters, **more):
     (finding("coulomb_friction", "joint", "elbow", parameter("frictionloss", 0.0, 0.1214, 0.0042, "N·m")),
      "joint elbow: Coulomb friction 0.121 ± 0.004 N·m was left out"),
     (finding("coulomb_friction", "joint", "elbow", parameter("frictionloss", 0.0, 0.15, 0.000023, "N·m")),
-     "joint elbow: Coulomb friction 0.1500 ± 0.00002 N·m was left out"),
+     "joint elbow: Coulomb friction 0.1500 ± 2e-5 N·m was left out"),
     (finding("mass", "body", "torso", parameter("mass", 3.56, 4.52, 0.031, "kg")), "body torso: mass 4.52 ± 0.03 kg instead of 3.56 (+27 %)"),
     (finding("delay", "actuator", "drive", parameter("seconds", 0.0, 0.0123, 0.0012, "s")), "actuator drive: delay 0.0123 ± 0.0012 s was left out"),
     (finding("external_force", "body", "cart", parameter("x", 0.0, 2.0, 0.1, "N"), when={"recording": "run3.csv", "time": [2.0, 7.5]}),
