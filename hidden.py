@@ -15,6 +15,8 @@ from collections import deque
 import mujoco
 import numpy as np
 
+import byhand
+
 FULL = mujoco.mjtState.mjSTATE_INTEGRATION
 SIMPLE = 0                                           # body/simple="false": centres of mass may move
 
@@ -40,7 +42,6 @@ class Real:
         self.rubs = [item for item in hidden if item["effect"] in RUBS
                      and (item["effect"] != "contact_friction" or self._slides(item))]
         self.rubbing = [self._dof(item) for item in self.rubs]
-        self.forced = [item for item in hidden if item["effect"] in FORCES]
         self.actuated = [item for item in hidden if item["effect"] in ACTUATORS]
         self.reset(model.qpos0, np.zeros(model.nv))
 
@@ -183,8 +184,14 @@ class Real:
         qvel = data.qvel + self.stage * dt * memory["acceleration"]
         force = np.zeros(model.nv)
         data.xfrc_applied[:] = 0.0
-        for item in self.forced:
-            self._force(item, qvel, force)
+        for item in self.hidden:
+            if item["effect"] in byhand.JOINT:
+                joint = self._joint(item)
+                dof, q = joint.dofadr[0], joint.qposadr[0]
+                angle = data.qpos[q] + (1 - self.stage) * dt * data.qvel[dof]     # RK4's middle, Euler's start
+                force[dof] += byhand.joint_force(item, angle - model.qpos_spring[q], angle, qvel[dof], data.time, joint)
+            elif item["effect"] in byhand.BODY:
+                byhand.body_force(item, model, data, memory["acceleration"], self.event)
         self._motor_faults(drive, qvel, force)
         before = data.qvel.copy()
         if self.backlash is not None:
@@ -308,64 +315,6 @@ class Real:
                 force = np.clip(force, -faults["saturation"]["forcerange"], faults["saturation"]["forcerange"])
             out[dof] += gear * (force - nominal)
 
-    def _force(self, item, qvel, out):
-        """Adds a hidden force to `out` (nv,), or to the bodies."""
-        effect, p, data = item["effect"], item["parameters"], self.data
-        if effect in ("gravity", "external_force", "payload_change", "air_drag", "wind"):
-            return self._body_force(item)
-        joint = self._joint(item)
-        dof, q = joint.dofadr[0], data.qpos[joint.qposadr[0]]
-        v = qvel[dof]
-        if self.stage < 1:
-            q = q + self.stage * self.dt * data.qvel[dof]
-        if effect == "viscous_damping":
-            out[dof] -= (p["damping"] - float(np.ravel(joint.damping)[0])) * v
-        elif effect == "quadratic_damping":
-            out[dof] -= p["damping2"] * v * abs(v)
-        elif effect == "stiffness":
-            out[dof] -= (p["stiffness"] - float(np.ravel(joint.stiffness)[0])) * (
-                q - self.model.qpos_spring[joint.qposadr[0]])
-        elif effect == "nonlinear_stiffness":
-            out[dof] -= p["stiffness3"] * (q - self.model.qpos_spring[joint.qposadr[0]]) ** 3
-        elif effect == "spring_offset":
-            out[dof] += p["torque"]
-        elif effect == "cogging":
-            out[dof] += p["amplitude"] * np.sin(p["poles"] * q + p["phase"])
-        elif effect == "joint_stop":
-            over = max(q - p["high"], 0.0) + min(q - p["low"], 0.0)
-            if over:
-                push = p["spring"] * over + p["damper"] * v
-                out[dof] -= push if push * over > 0 else 0.0                 # a stop never pulls
-        elif effect == "periodic_torque":
-            out[dof] += p["amplitude"] * np.sin(2 * np.pi * p["hertz"] * data.time + p["phase"])
-        elif effect == "detent":
-            out[dof] -= p["amplitude"] * (q - p["at"]) / p["width"] * np.exp(
-                0.5 - 0.5 * ((q - p["at"]) / p["width"]) ** 2)
-        elif effect == "one_way_drag":
-            out[dof] -= p["drag"] * max(v, 0.0) ** 3
-
-    def _body_force(self, item):
-        effect, p, model, data = item["effect"], item["parameters"], self.model, self.data
-        if effect == "gravity":
-            change = np.array([p[k] for k in "xyz"]) - model.opt.gravity
-            data.xfrc_applied[:, :3] += model.body_mass[:, None] * change
-        elif effect == "external_force" and (self.event or not p.get("event")):
-            data.xfrc_applied[model.body(item["place"]["name"]).id, :3] += [p[k] for k in "xyz"]
-        elif effect == "payload_change" and self.event:                       # hung at the centre of mass
-            body = model.body(item["place"]["name"]).id
-            jacobian = np.zeros((3, model.nv))
-            mujoco.mj_fwdPosition(model, data)       # after a step these are one step old
-            mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
-            acceleration = jacobian @ self.memory["acceleration"]
-            data.xfrc_applied[body, :3] += p["mass"] * (model.opt.gravity - acceleration)
-        elif effect in ("air_drag", "wind"):
-            wind = np.array([p[k] for k in "xyz"]) if effect == "wind" else model.opt.wind
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fwdVelocity(model, data)
-            density = p["density"] if effect == "air_drag" else model.opt.density
-            data.xfrc_applied += (drag(model, data, density, wind)
-                                  - drag(model, data, model.opt.density, model.opt.wind))
-
     def _couple(self, drive, out):
         """Motor and load with a gap between: the motor's own motion, by hand; teeth are stiff springs."""
         joint, p = self._joint(self.backlash), self.backlash["parameters"]
@@ -388,9 +337,6 @@ class Real:
 
 
 RUBS = ("coulomb_friction", "stribeck_friction", "contact_friction", "friction_patch")
-FORCES = ("viscous_damping", "quadratic_damping", "stiffness", "nonlinear_stiffness", "spring_offset",
-          "cogging", "joint_stop", "periodic_torque", "detent", "one_way_drag", "gravity",
-          "external_force", "payload_change", "air_drag", "wind")
 ACTUATORS = ("gain", "bias", "delay", "lag", "saturation", "back_emf", "dead_zone", "fading_gain")
 
 
@@ -408,30 +354,3 @@ def _build(spec, item):
     elif item["effect"] == "link_length":
         body = spec.body(name)
         body.pos = np.asarray(body.pos) * item["parameters"]["length"] / np.linalg.norm(body.pos)
-
-
-def drag(model, data, density, wind):
-    """Air drag on every body's box of equal inertia, as force and torque at its centre (nbody, 6).
-
-    Each face pair of area A meets the air at speed w: force -density A w |w| / 2 along its normal.
-    Spin: the same pressure over faces turning through the air, as MuJoCo's inertia-box model has it.
-    """
-    out = np.zeros((model.nbody, 6))
-    velocity = np.empty(6)
-    for body in range(1, model.nbody):
-        mass, inertia = model.body_mass[body], model.body_inertia[body]
-        if mass <= 0:
-            continue
-        total = inertia.sum()
-        box = np.sqrt(np.maximum(6 * (total - 2 * inertia) / mass, 0.0))     # full edge lengths
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-        frame = data.ximat[body].reshape(3, 3)
-        spin = frame.T @ velocity[:3]
-        flow = frame.T @ (velocity[3:] - wind)
-        area = np.array([box[1] * box[2], box[0] * box[2], box[0] * box[1]])
-        force = -0.5 * density * area * np.abs(flow) * flow
-        lever = np.array([box[0] * (box[1] ** 4 + box[2] ** 4), box[1] * (box[0] ** 4 + box[2] ** 4),
-                          box[2] * (box[0] ** 4 + box[1] ** 4)])
-        torque = -density * lever * np.abs(spin) * spin / 64
-        out[body, :3], out[body, 3:] = frame @ force, frame @ torque
-    return out

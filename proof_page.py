@@ -107,17 +107,18 @@ def agrees(row):
 
 
 def confusion(rows):
-    """(truths, names, counts): singles and nulls by what the first finding says, counted as the contract does."""
+    """(truths, names, counts) of trials with at most one thing hidden: its own name where a finding has it, else the first."""
     pairs = []
     for row in rows:
         if row["kind"] not in ("single", "null", "unknown"):
             continue
         truth = row["hidden"][0]["effect"] if row["hidden"] else "(nothing)"
-        claims = [f for f in row["findings"] if f["effect"] != "time_step" or truth == "time_step"]
-        name = claims[0]["effect"] if claims else "(nothing)" if row["exit"] == "0" else "(no diagnosis)"
-        expected = "unknown" if truth in UNKNOWNS else truth
-        pairs.append((truth, expected if row["found"] and not any(f["effect"] == expected for f in claims[:1]) and row["first"]
-                      else name))
+        claims = [f["effect"] for f in row["findings"] if f["effect"] != "time_step" or truth == "time_step"]
+        if row["first"]:
+            name = "unknown" if truth in UNKNOWNS else truth
+        else:
+            name = claims[0] if claims else "(nothing)" if row["exit"] == "0" else "(no diagnosis)"
+        pairs.append((truth, name))
     truths = sorted({t for t, _ in pairs})
     names = sorted({n for _, n in pairs} | set(truths) - set(UNKNOWNS))
     counts = np.zeros((len(truths), len(names)), int)
