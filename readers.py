@@ -318,5 +318,5 @@ def _episode(path, episode, model, dt):
         qpos = np.full((len(seen), model.nq), np.nan)
         qpos[:, left_out:] = seen[:, :model.nq - left_out]
         qvel = seen[:, model.nq - left_out:].copy()
-        qvel[np.abs(qvel) >= 10] = np.nan  # Hopper and Walker2d clip the observed velocity there
+        qvel[np.abs(qvel) == 10] = np.nan  # where Hopper and Walker2d clip the observed velocity
     return {"time": dt * np.arange(len(qpos)), "qpos": qpos, "qvel": qvel, "ctrl": ctrl[:len(qpos)]}

@@ -3,6 +3,7 @@ import io
 import os
 import sys
 import time
+import types
 
 import mujoco
 import numpy as np
@@ -101,6 +102,38 @@ def test_sensors(tmp_path, model, good):
     np.testing.assert_allclose(got.sensors["encoder"], good[:, 1:2], rtol=1e-8)
     got, = load(put(tmp_path, archive(**whole(good), **{"sensor:encoder": good[:, 1]}), "run.npz"), model)
     np.testing.assert_array_equal(got.sensors["encoder"], good[:, 1:2])
+
+
+class Minari(types.ModuleType):
+    """As much of the optional package as the reader uses, holding two episodes of a Hopper-like observation."""
+
+    def __init__(self, infos):
+        super().__init__("minari")
+        seen = np.arange(33, dtype=float).reshape(11, 3)  # qpos without its first, then qvel
+        seen[5, 2] = 10.0  # clipped
+        actions = np.arange(20, dtype=float).reshape(10, 2)
+        self.episodes = [types.SimpleNamespace(id=k, observations=seen, actions=actions, infos=infos) for k in range(2)]
+
+    def load_dataset(self, name):
+        if name != "arm/random-v0":
+            raise ValueError(f"no local dataset {name}")
+        env = types.SimpleNamespace(unwrapped=types.SimpleNamespace(dt=0.05), close=lambda: None)
+        return types.SimpleNamespace(recover_environment=lambda: env, iterate_episodes=lambda: iter(self.episodes))
+
+
+def test_minari_episodes(model, monkeypatch):
+    monkeypatch.setitem(sys.modules, "minari", Minari(None))
+    first, second = load("arm/random-v0", model)
+    assert (first.name, second.name) == ("random-v0:0", "random-v0:1")
+    np.testing.assert_allclose(first.time, 0.05 * np.arange(11))
+    assert np.isnan(first.qpos[:, 0]).all() and first.qpos[3, 1] == 9.0
+    assert first.qvel[4].tolist() == [13.0, 14.0] and np.isnan(first.qvel[5, 1]) and np.isnan(first.qvel[3, 0])
+    assert first.ctrl[-1].tolist() == first.ctrl[-2].tolist() == [18.0, 19.0]
+    infos = {"qpos": np.ones((11, 2)), "qvel": np.zeros((11, 2))}
+    monkeypatch.setitem(sys.modules, "minari", Minari(infos))
+    assert (load("arm/random-v0", model)[1].qpos == 1).all()
+    with pytest.raises(RecordingError, match="arm/expert-v0.*not a readable Minari dataset"):
+        load("arm/expert-v0", model)
 
 
 def test_files_of_one_name_are_told_apart(tmp_path, model, good):
