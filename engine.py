@@ -17,7 +17,7 @@ from mujoco.batch import Batch, SimulationError
 from readout import read
 from signals import Signal
 
-COPIES = 64  # edited models kept for the next call
+COPY_BYTES = 50e6  # of edited models kept for the next call
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
@@ -60,6 +60,7 @@ class Engine:
         self.rest = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.data, self.rest, STATE)
         self.copies, self.batch = OrderedDict(), None
+        self.most_copies = max(64, int(COPY_BYTES / mujoco.mj_sizeModel(self.model)))
 
     def run(self, cases, start_qpos, start_qvel, windows, rows, step, count, stepwise, sensors):
         """World.simulate for simulations that share structure, time step and way of stepping."""
@@ -129,7 +130,7 @@ class Engine:
             except mujoco.FatalError:
                 model = None
         self.copies[key] = model
-        if len(self.copies) > COPIES:
+        if len(self.copies) > self.most_copies:
             self.copies.popitem(last=False)
         return model
 

@@ -276,7 +276,7 @@ class Backlash(JointEffect):
     """Play of width `gap` between motor and load; the sensor sits at the motor.
 
     The recorded joint becomes the motor's; a second one in the same body, limited
-    to ± gap/2, carries the load. The motor side needs inertia of its own: without
+    to ± gap/2 and in the middle at the start of a run, carries the load. The motor side needs inertia of its own: without
     armature it gets one per cent of the joint's.
     """
     name, simplicity = 'backlash', 3
