@@ -207,7 +207,7 @@ def test_coulomb_friction_holds():
 def test_signal_against_a_plain_loop(seed, delay, lag):
     """A held, delayed, filtered control, sampled in steps, against 1 µs steps of the differential equation."""
     rng = np.random.default_rng(seed)
-    time, value = np.cumsum(rng.uniform(0.001, 0.02, 12)), rng.normal(size=12)
+    time, value = np.cumsum(rng.uniform(0.001, 0.02, 12)), rng.uniform(-1, 1, 12)
     start, step, count, fine = time[4], 0.002, 10, 1e-5
     t = np.arange(time[0] - fine, start + step * count, fine) + fine / 2
     u = value[np.maximum(np.searchsorted(time, t - delay, side='right') - 1, 0)]
