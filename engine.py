@@ -16,6 +16,7 @@ from mujoco.batch import Batch, SimulationError
 
 from readout import read
 from signals import Signal
+from surroundings import touchable
 
 COPY_BYTES = 50e6  # of edited models kept for the next call
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -49,7 +50,11 @@ class Engine:
             spec.delete(texture)
         for candidate in structure:
             candidate.effect.build(spec, nominal, candidate.effect.id(nominal, candidate.place.name))
-        self.model = spec.compile()
+        self.model = m = spec.compile()
+        idle = mujoco.mjtDisableBit.mjDSBL_ISLAND if m.ntree < 2 else 0
+        if not (m.npair or m.nflex or any(touchable(m, i).any() for i in range(m.ngeom))):
+            idle |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        m.opt.disableflags |= int(idle)  # what there is nothing to do for still takes its time
         # where the nominal model's coordinates are in the working model, which may have more joints
         self.q, self.v = [], []
         for j in range(nominal.njnt):

@@ -79,6 +79,16 @@ class TimeStep(Effect):
 
 # ---------------------------------------------------------------- contacts
 
+def touchable(model, i):
+    """Which geoms (ngeom,) geom i can collide with, by MuJoCo's rules."""
+    weld, parent = model.body_weldid[model.geom_bodyid], model.body_weldid[model.body_parentid]
+    meets = ((model.geom_contype[i] & model.geom_conaffinity) | (model.geom_contype & model.geom_conaffinity[i])) != 0
+    meets &= weld != weld[i]
+    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):  # parent and child pass through each other, but for the world
+        meets &= ~((weld != 0) & (weld[i] != 0) & ((parent[weld] == weld[i]) | (parent[weld[i]] == weld)))
+    return meets & (not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT))
+
+
 class ContactEffect(Effect):
     """An effect on all contacts of one geom, which gets priority over its partners.
 
@@ -92,18 +102,12 @@ class ContactEffect(Effect):
 
     @staticmethod
     def partner(model, i):
-        """The geom this one mostly touches: a static one if any, else that with most friction."""
-        body, root = model.geom_bodyid, model.body_weldid
-        weld, mine = root[body], root[body[i]]
-        meets = ((model.geom_contype[i] & model.geom_conaffinity) | (model.geom_contype & model.geom_conaffinity[i])) != 0
-        meets &= weld != mine  # neither itself nor welded to it
-        parent = root[model.body_parentid[weld]]
-        kin = (parent == mine) & (mine != 0) | (weld == root[model.body_parentid[mine]]) & (weld != 0)
-        if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
-            meets &= ~kin
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT) or not meets.any():
+        """The geom this one mostly touches: a static one if any, else that with most friction; None if it can touch none."""
+        meets = touchable(model, i)
+        if not meets.any():
             return None
-        return int(np.argmax(np.where(meets, model.geom_friction[:, 0] + 1e6 * (weld == 0), -1.0)))
+        static = model.body_weldid[model.geom_bodyid] == 0
+        return int(np.argmax(np.where(meets, model.geom_friction[:, 0] + 1e6 * static, -1.0)))
 
     @classmethod
     def pair(cls, model, i):
