@@ -22,6 +22,7 @@ h3 small{font-weight:400;color:var(--soft)}
 .steps{display:flex;flex-wrap:wrap;gap:10px;margin:1em 0 .2em}
 .steps div{flex:1 1 90px;background:var(--card);border-radius:10px;padding:10px 14px;border-left:5px solid var(--noise)}
 .steps .nominal{border-color:var(--nominal)}.steps .corrected{border-color:var(--corrected)}
+.steps small{font-size:.9rem;font-weight:400}
 .steps b{display:block;font-size:1.5rem;line-height:1.2}
 .steps span{color:var(--soft);font-size:.82rem}
 .pair{display:grid;grid-template-columns:minmax(0,1fr);gap:16px}
@@ -38,7 +39,7 @@ svg text{font-family:inherit;fill:var(--ink)}
 .axis{font-size:11.5px}
 .grid{stroke:var(--rule);stroke-width:1;fill:none}
 .line{fill:none;stroke-width:1.7;stroke-linejoin:round}
-.wide .line{stroke-width:1.5}
+.wide .line{stroke-width:1.5}.wide .measured.line{stroke-width:4;opacity:.3;stroke-linecap:round}
 .measured{stroke:var(--measured)}.nominal{stroke:var(--nominal)}.corrected{stroke:var(--corrected)}
 .noise{stroke:var(--noise);stroke-dasharray:5 4}
 .dots{fill:none;stroke-width:3;stroke-linecap:round;opacity:.22}

@@ -11,6 +11,8 @@ import tempfile
 import numpy as np
 
 import drawing
+import experiments
+import leftover
 import motion
 import wording
 from figures import Series, binned, chart, whisker
@@ -116,16 +118,15 @@ def _legend(*looks):
 
 def _head(summary, title):
     findings = "".join(f"<li>{E(wording.finding_words(finding))}</li>" for finding in summary["findings"])
-    fit = summary["fit"]["held_out"]
-    steps = "".join(f'<div class="{look}"><b>{E(wording.number(fit[key], 2))}</b><span>{words}</span></div>'
-                    for key, look, words in (("before", "nominal", "nominal model"), ("after", "corrected", "corrected model"),
-                                             ("floor", "noise", "noise alone")) if fit.get(key) is not None)
+    before, after, floor, unit, place = wording.errors(summary)
+    steps = "".join(f'<div class="{look}"><b>{E(value)} <small>{E(unit)}</small></b><span>{words}</span></div>'
+                    for value, look, words in ((before, "nominal", "nominal model"), (after, "corrected", "corrected model"), (floor, "noise", "noise alone")))
     left = wording.unexplained_words(summary)
     return (f'<header><p class="kicker">{E(title)}</p><h1 class="{summary["verdict"]}">{E(wording.verdict_words(summary))}</h1>'
             f'{f"<ol class=verdict>{findings}</ol>" if findings else ""}'
             f'<p>{E(wording.sentence(wording.error_words(summary)))}{" " + E(wording.sentence(left)) if left else ""}</p>'
-            f'<div class="steps">{steps}</div><p class="note">Error on recordings held out, {fit.get("horizon_s", 0.3):g} s ahead, '
-            "in multiples of each channel’s noise.</p></header>")
+            f'<div class="steps">{steps}</div><p class="note">Error{E(place)} on recordings held out, '
+            f'{summary["fit"]["held_out"].get("horizon_s", 0.3):g} s ahead.</p></header>')
 
 
 def _mechanism(diagnosis):
@@ -146,12 +147,13 @@ def _mechanism(diagnosis):
 
 def _findings(diagnosis):
     cards = []
+    left = leftover.residuals(diagnosis)
     for i, finding in enumerate(diagnosis.summary["findings"]):
         rows = "".join(f"<tr><td>{E(p['name'])}</td><td>{E(wording.estimate(p))}</td><td>{E(wording.number(p['nominal']))}</td>"
                        f"<td>{whisker(p)}</td></tr>" for p in finding["parameters"])
         table = (f'<div class="scroll"><table><thead><tr><th>parameter</th><th>value, 95 %</th><th>nominal</th><th></th></tr></thead>'
                  f"<tbody>{rows}</tbody></table></div>") if rows else ""
-        plots = "".join(_residual(r) for r in diagnosis.residuals if r["finding"] == i)
+        plots = "".join(_residual(r) for r in left if r["finding"] == i)
         curves = "".join(_box(chart([Series(c["x"], c["force"], "corrected")], wording.axis_words(c["variable"]), f"force ({c['unit']})",
                                     label="the unknown force")) for c in diagnosis.unknown_curves if c["finding"] == i)
         evidence = finding.get("evidence") or {}
@@ -172,12 +174,12 @@ def _findings(diagnosis):
 
 
 def _residual(residual):
-    """Residual force against the variable that it depends on, before and after, with the bins' medians."""
+    """Force left over against the variable that it depends on, before and after, with the bins' medians."""
     x, before, after = (np.asarray(residual[key], float) for key in ("x", "before", "after"))
     unit = residual["unit"]
     picture = chart([Series(x, before, "nominal faint", "dots"), Series(x, after, "corrected faint", "dots"),
                      Series(*binned(x, before), "nominal"), Series(*binned(x, after), "corrected")],
-                    wording.axis_words(residual["variable"], residual.get("x_unit")), f"residual ({unit})", label="residual against " + residual["variable"])
+                    wording.axis_words(residual["variable"], residual["x_unit"]), f"force left at {residual['joint']} ({unit})", label="residual against " + residual["variable"])
     legend = _legend(("nominal", "left over by the nominal model"), ("corrected", "by the corrected one"))
     return f"<div>{legend}{_box(picture)}</div>" if picture else ""
 
@@ -190,7 +192,7 @@ def _prediction(diagnosis):
         x, before, after, floor = (np.array([np.nan if point.get(key) is None else point[key] for point in curve], dtype=float)
                                    for key in ("seconds", "before", "after", "floor"))
         spread = np.nanmax(before) > 8 * max(np.nanmin(after), 1e-12)
-        picture = (_legend(("nominal", "nominal"), ("corrected", "corrected"), ("noise", "noise floor"))
+        picture = (_legend(("nominal", "nominal"), ("corrected", "corrected"), *([("noise", "noise alone")] if np.isfinite(floor).any() else []))
                    + _box(chart([Series(x, before, "nominal"), Series(x, after, "corrected"), Series(x, floor, "noise")], "horizon (s)",
                                 "error (× noise)", log_y=bool(spread), zero=not spread, label="error against horizon")))
     rows = []
@@ -215,7 +217,7 @@ def _traces(diagnosis):
     def draw(i):
         trace = diagnosis.traces[i]
         time = np.asarray(trace["time"], float)
-        lines = [Series(time, np.asarray(trace[look], float), look) for look in ("nominal", "corrected", "measured")]
+        lines = [Series(time, np.asarray(trace[look], float), look) for look in ("measured", "nominal", "corrected")]
         return (f'<h3 class="trace">{E(trace["channel"])} <small>{E(trace["recording"])}</small></h3>'
                 + _box(chart(lines, "time (s)", trace["channel"].split(":", 1)[-1], 900, 240, label=f"{trace['channel']} over time"), wide=True))
 
@@ -248,7 +250,7 @@ def _ranking(diagnosis):
 
 
 def _advice(diagnosis):
-    items = "".join(f"<li>{E(line)}</li>" for line in diagnosis.advice)
+    items = "".join(f"<li>{E(line)}</li>" for line in experiments.advice(diagnosis.summary["findings"]))
     return _section("What cannot be told apart, and the experiment that would", f"<ul>{items}</ul>") if items else ""
 
 

@@ -6,6 +6,8 @@ or of column leaves the two sides unrelated, whatever small physics the model la
 import mujoco
 import numpy as np
 
+import leftover
+
 CENTRES = 400  # rows at which the law is tested
 UNLIKE = 0.35  # imbalance (0: the law holds, 1: one side dwarfs the other) above which a reading can be wrong;
 UNIT_GAIN, SWAP_GAIN = 2, 3  # the right one divides it by so much. Missing friction alone reaches 0.7, but no wrong reading
@@ -17,7 +19,7 @@ def suspect(recording, model):
     actuator states or joints that were not measured."""
     if model.nq != model.nv or model.na or model.nq == 0 or np.isnan(recording.qpos).all(axis=0).any():
         return None
-    states = _smooth(recording, model.opt.timestep)
+    states = leftover.smooth(recording, CENTRES)[1:]
     if len(states[0]) < 20:
         return None
     now = _imbalance(model, *states)
@@ -54,22 +56,6 @@ def suspect(recording, model):
         if concerned and (now[concerned] > UNLIKE).all() and (_imbalance(model, *reading) < now / gain)[concerned].all():
             return message
     return None
-
-
-def _smooth(recording, timestep):
-    """Positions, velocities, accelerations (n, nv) by local parabolas, and the mean control (n, nu) beside them."""
-    time, rows = recording.time, len(recording.time)
-    half = max(3, int(round(0.03 / np.median(np.diff(time)))))
-    centres = np.unique(np.linspace(half, rows - half - 1, CENTRES).astype(int)) if rows > 2 * half + 1 else []
-    found = []
-    for centre in centres:
-        near = slice(centre - half, centre + half + 1)
-        if np.isnan(recording.qpos[near]).any():
-            continue
-        t = time[near] - time[centre]
-        fit = np.linalg.lstsq(np.stack([np.ones_like(t), t, t * t / 2], axis=1), recording.qpos[near], rcond=None)[0]
-        found.append((*fit, recording.ctrl[near.start:near.stop - 1].mean(axis=0)))
-    return [np.array(x) for x in zip(*found)] if found else [np.empty((0, 0))] * 4
 
 
 def _scaled(states, scale, second):

@@ -96,23 +96,24 @@ def depends_words(depends_on):
     return " and ".join(words)
 
 
+def errors(summary):
+    """Held-out error as words (before, after, floor, unit, place): in SI at the channel in which the two models differ most
+    (counted in noise), or over all channels in multiples of the noise."""
+    fit = summary["fit"]["held_out"]
+    channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"]}
+    if not channels:
+        return *(number(fit[key], 2) for key in ("before", "after", "floor")), "times the noise", ""
+    name = max(channels, key=lambda n: abs(channels[n]["before"] - channels[n]["after"]) / channels[n]["floor"])
+    unit, factor = SMALL.get(channels[name]["unit"], (channels[name]["unit"], 1))
+    return *(number(channels[name][key] * factor, 2) for key in ("before", "after", "floor")), unit, " at " + name.split(":", 1)[1]
+
+
 def error_words(summary):
     """"held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; the sensors' noise alone makes 1 mrad"."""
-    fit = summary["fit"]["held_out"]
-    ahead = f"{fit.get('horizon_s', 0.3):g} s ahead"
-    channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"] and c["before"] is not None}
-    if channels:
-        # the channel in which the two models differ most, counted in noise
-        name = max(channels, key=lambda n: abs(channels[n]["before"] - channels[n]["after"]) / channels[n]["floor"])
-        before, after, floor, unit = (channels[name][key] for key in ("before", "after", "floor", "unit"))
-        unit, factor = SMALL.get(unit, (unit, 1))
-        before, after, floor = (f"{number(x * factor, 2)}" for x in (before, after, floor))
-        place = " at " + name.split(":", 1)[1]
-    else:
-        before, after, floor, unit, place = *(number(fit[key], 2) for key in ("before", "after", "floor")), "times the noise", ""
-    if summary["verdict"] == "match":
-        return f"held-out error {ahead} is {before} {unit}{place}; the sensors' noise alone makes {floor} {unit}"
-    return f"held-out error {ahead} falls from {before} to {after} {unit}{place}; the sensors' noise alone makes {floor} {unit}"
+    before, after, floor, unit, place = errors(summary)
+    ahead = f"held-out error {summary['fit']['held_out'].get('horizon_s', 0.3):g} s ahead"
+    change = f"is {before} {unit}" if summary["verdict"] == "match" else f"falls from {before} to {after} {unit}"
+    return f"{ahead} {change}{place}; the sensors' noise alone makes {floor} {unit}"
 
 
 def unexplained_words(summary):

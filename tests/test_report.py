@@ -16,7 +16,9 @@ import pytest
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import drawing
+import experiments
 import figures
+import leftover
 import motion
 import report
 from recordings import Recording
@@ -54,21 +56,19 @@ def diagnosis():
                "warnings": ["run5.csv: ctrl:elbow_motor <stays> at its extreme"]}
     traces = [{"recording": r.name, "channel": f"qpos:{name}", "time": r.time, "measured": r.qpos[:, k], "nominal": r.qpos[:, k] + 0.1,
                "corrected": np.where(np.arange(len(r.time)) % 30 == 0, np.nan, r.qpos[:, k])} for r in held for k, name in enumerate(("shoulder", "elbow"))]
-    v = np.random.default_rng(0).normal(size=900)
-    residuals = [{"finding": 0, "variable": "velocity:elbow", "x": v, "before": -0.12 * np.sign(v), "after": 0.01 * v, "unit": "N·m", "x_unit": "rad/s"}]
     ranking = [{"effect": "coulomb_friction", "place": {"kind": "joint", "name": "elbow"}, "error_removed": 0.6, "p_value": 0.0},
                {"effect": "wind", "place": {"kind": "world", "name": "world"}, "error_removed": float("nan"), "p_value": float("nan")}]
     curves = [{"finding": 1, "variable": "position:elbow", "x": np.linspace(-1, 1, 9), "force": np.linspace(0, 1, 9), "unit": "N·m"}]
     return types.SimpleNamespace(
         summary=summary, corrected_xml=ARM.replace('range="-2.9', 'frictionloss="0.12" range="-2.9'), world=types.SimpleNamespace(model=arm()),
-        settings={"elbow": (0.12,)}, ranking=ranking, traces=traces, residuals=residuals, advice=["Drive the elbow slowly & reverse it."],
+        settings={"elbow": (0.12,)}, ranking=ranking, traces=traces,
         train=train, held_out=held, unknown_curves=curves)
 
 
 @pytest.fixture
 def matched(diagnosis):
     diagnosis.summary = {**diagnosis.summary, "verdict": "match", "findings": [], "warnings": []}
-    diagnosis.settings, diagnosis.residuals, diagnosis.advice, diagnosis.unknown_curves = {}, [], [], []
+    diagnosis.settings, diagnosis.unknown_curves = {}, []
     return diagnosis
 
 
@@ -254,6 +254,32 @@ def test_overlay_finds_recorded_joints_in_a_model_with_more(diagnosis):
     assert qpos.tolist() == [0, 2] == dof.tolist()
 
 
+def test_leftover_force_is_the_one_that_was_left_out():
+    """Recorded with viscous damping 0.3, nominal without: the residual is -0.3 times the velocity, the corrected one's none."""
+    def made(damping):
+        return mujoco.MjModel.from_xml_string(ARM.replace('damping="0.05"', f'damping="{damping}"'))
+    truth, rows, data = made(0.3), [], None
+    data = mujoco.MjData(truth)
+    for k in range(3000):
+        data.ctrl[:] = np.sin(3 * data.time), 0.3 * np.sin(7 * data.time)
+        if k % 5 == 0:
+            rows.append([data.time, *data.qpos, *data.qvel, *data.ctrl])
+        mujoco.mj_step(truth, data)
+    rows = np.array(rows)
+    time, qpos, qvel, qacc, ctrl = leftover.smooth(Recording("r", rows[:, 0], rows[:, 1:3], rows[:, 3:5], rows[:, 5:7]), 300)
+    np.testing.assert_allclose(qvel, rows[np.searchsorted(rows[:, 0], time - 1e-9), 3:5], atol=0.05)
+    missing = leftover.forces(made(0.0), qpos, qvel, qacc, ctrl)
+    np.testing.assert_allclose(missing, -0.3 * qvel, atol=0.05)
+    assert np.abs(leftover.forces(truth, qpos, qvel, qacc, ctrl)).max() < 0.05 < 0.3 * np.abs(qvel).max() / 5
+
+
+def test_every_pair_of_rivals_has_an_experiment():
+    rival = {"effect": "lag", "place": {"kind": "actuator", "name": "drive"}}
+    line, = experiments.advice([{"effect": "delay", "place": {"kind": "actuator", "name": "drive"}, "also_possible": [rival]},
+                                {"effect": "mass", "place": {"kind": "body", "name": "torso"}, "also_possible": []}])
+    assert line.startswith("Delay of actuator drive or lag of actuator drive: drive with a sine")
+
+
 # --- the page ---
 
 class Tags(HTMLParser):
@@ -288,8 +314,8 @@ def test_page_is_well_formed_and_self_contained(kind, request):
 
 def test_page_says_it_all(diagnosis):
     page = report.html_page(diagnosis)
-    for words in ("joint elbow: Coulomb friction 0.120 ± 0.004 N·m was left out", "dead zone", "Drive the elbow slowly &amp; reverse it.",
-                  "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "residual (N·m)", "badmark"):
+    for words in ("joint elbow: Coulomb friction 0.120 ± 0.004 N·m was left out", "dead zone", "push the joint by hand with the actuator off",
+                  "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "force left at elbow (N·m)", "badmark"):
         assert words in page, words
 
 
