@@ -1,0 +1,102 @@
+"""Mechanisms, recordings and the plain loop that the tests of effects and simulator share."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+
+from world import Window, World
+
+ARM = """
+<mujoco model="arm">
+  <compiler angle="{angle}" autolimits="true"/>
+  <option timestep="0.002" integrator="{integrator}" density="1.2" wind="0.5 0 0"/>
+  <default><geom contype="0" conaffinity="0"/><motor ctrlrange="-9 9"/></default>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 .1" contype="1" conaffinity="1"/>
+    <body name="base" pos="0 0 .45">
+      <joint name="lift" type="slide" axis="0 0 1" damping="3" stiffness="400"/>
+      <geom type="box" size=".05 .05 .05" mass="1.3"/>
+      <body name="upper" pos="0.1 0 0.02">
+        <joint name="swing" type="hinge" axis="0 1 0" damping="0.05" armature="0.01" ref="{ref}"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="0.7123456789"/>
+        <body name="fore" pos=".3 0 .01">
+          <joint name="elbow" type="hinge" axis="0 1 0" damping="0.03 0.01" armature="0.005" stiffness="0.4" springref="{springref}"/>
+          <geom name="tip" type="capsule" fromto="0 0 0 .25 0 0" size=".025" mass="0.4" contype="1" conaffinity="1" friction="0.7"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>{actuators}</actuator>
+  <sensor><jointpos name="angle" joint="elbow"/><gyro name="spin" site="s"/></sensor>
+</mujoco>""".replace('<geom name="tip"', '<site name="s" pos=".1 0 0"/><geom name="tip"')
+MOTORS = '<motor name="push" joint="lift" gear="20"/><motor joint="swing" gear="2"/><motor name="bend" joint="elbow" gear="0.5" forcerange="-4 4"/>'
+SERVOS = ('<velocity name="push" joint="lift" kv="60"/><position joint="swing" kp="30" kv="1.5"/>'
+          '<position name="bend" joint="elbow" kp="12" kv="0.4" forcerange="-3 3"/>')
+MODELS = {'motors': (MOTORS, 'implicitfast', 'radian'), 'servos': (SERVOS, 'implicitfast', 'degree'),
+          'euler': (MOTORS, 'Euler', 'degree'), 'rk4': (MOTORS, 'RK4', 'radian')}
+# a size at which each effect matters, as a function of its nominal values and steps
+SIZES = {'mass': (0.9,), 'center_of_mass': (0.12, 0.02, -0.03), 'inertia': (0.004, 0.005, 0.006), 'link_length': (0.36,), 'armature': (0.02,),
+         'viscous_damping': (0.3,), 'quadratic_damping': (0.15,), 'coulomb_friction': (0.2,), 'stribeck_friction': (0.1, 0.2, 0.3), 'stiffness': (1.5,),
+         'nonlinear_stiffness': (2.0,), 'spring_offset': (0.4,), 'cogging': (0.3, 7.0, 0.5), 'joint_stop': (-0.3, 0.25), 'backlash': (0.05,), 'gain': (1.3,),
+         'bias': (0.3,), 'back_emf': (0.6,), 'saturation': (1.0,), 'delay': (0.0053,), 'lag': (0.011,), 'dead_zone': (0.4,), 'gravity': (0.7, 0.0, -9.0),
+         'wind': (6.0, 1.0, -2.0), 'air_drag': (30.0,), 'time_step': (0.001,), 'contact_friction': (0.2,), 'contact_stiffness': (9000.0,),
+         'contact_damping': (40.0,), 'ground_height': (0.01,), 'sensor_bias': (0.05,), 'sensor_scale': (1.05,), 'sensor_delay': (0.0047,),
+         'external_force': (1.0, -0.5, 2.0), 'payload_change': (0.9,)}
+T, DT = 60, 0.01
+
+
+def arm(kind):
+    """World and MJCF of an arm with a lift that reaches the floor; one actuator is unnamed."""
+    actuators, integrator, angle = MODELS[kind]
+    degree = angle == 'degree'
+    xml = ARM.format(actuators=actuators, integrator=integrator, angle=angle, ref=20 if degree else 0.35, springref=-10 if degree else -0.2)
+    return World(mujoco.MjSpec.from_string(xml)), xml
+
+
+def record(world, seed=0, rows=T, dt=DT):
+    """A made-up recording: random held controls, made strong enough to move and touch the floor."""
+    rng = np.random.default_rng(seed)
+    ctrl = np.repeat(rng.uniform(-1, 1, (rows // 4 + 1, world.model.nu)), 4, axis=0)[:rows] * [1.0, 2.0, 3.0][:world.model.nu]
+    return SimpleNamespace(name='made-up', time=np.arange(rows) * dt, ctrl=ctrl)
+
+
+def stock(xml, world, recording, qpos, qvel, rows=T):
+    """The loop anybody would write: load the file, set the start by name, step, read by name."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    joints = [world.model.joint(j).name for j in range(world.model.njnt)]
+    for name, q, v in zip(joints, qpos, qvel):
+        data.joint(name).qpos, data.joint(name).qvel = q, v
+    for a in range(world.model.nactuator):  # at rest in the first control
+        first = np.clip(recording.ctrl[0, a], *model.actuator_ctrlrange[a]) if model.actuator_ctrllimited[a] else recording.ctrl[0, a]
+        if model.actuator_delay[a] > 0:
+            past = -model.opt.timestep * np.arange(model.actuator_history[a, 0], 0, -1)
+            mujoco.mj_initCtrlHistory(model, data, a, past, np.full(len(past), first))
+        if model.actuator_actadr[a] >= 0:
+            data.act[model.actuator_actadr[a]] = first
+    out = [np.concatenate([data.joint(n).qpos for n in joints])]
+    for t in range(rows - 1):
+        for a in range(world.model.nactuator):
+            data.ctrl[a] = recording.ctrl[t, a]  # appended actuators come last, without controls
+        for _ in range(round((recording.time[t + 1] - recording.time[t]) / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+        out.append(np.concatenate([data.joint(n).qpos for n in joints]))
+    return np.array(out)
+
+
+START = np.array([0.02, 0.4, -0.3]), np.array([0.1, -0.5, 0.8])
+
+
+def simulate(world, settings, recording, rows=T, **options):
+    n = len(settings)
+    return world.simulate(settings, *(np.tile(x, (n, 1)) for x in START), [Window(recording, 0, rows - 1)] * n, **options)[0]
+
+
+PENDULUM = """
+<mujoco><option timestep="0.001" integrator="{}"/><worldbody><body><joint name="j" axis="0 1 0"/>
+<inertial pos="0 0 -.1" mass=".5" diaginertia=".02 .02 .02"/></body></worldbody><actuator><motor name="m" joint="j"/></actuator></mujoco>"""
+
+
+def pendulum(integrator='implicitfast'):
+    return World(mujoco.MjSpec.from_string(PENDULUM.format(integrator)))
