@@ -406,3 +406,20 @@ def test_run_resumes_and_the_page_is_whole(tmp_path, monkeypatch):
 
 def test_final_seed_is_no_development_seed():
     assert conceal.FINAL_SEED not in conceal.DEVELOPMENT_SEEDS
+
+
+# whole trials, diagnosed
+
+@pytest.mark.parametrize("number,expected", [(3, "gravity"), (10, None), (20, None), (26, "sensor_scale")])
+def test_a_sealed_trial_scores_as_expected(tmp_path, number, expected):
+    """Development seed 1: a tilted Furuta pendulum, two systems with nothing hidden, a miscalibrated encoder."""
+    row = prove.run_trial(1, number, tmp_path / "sealed")
+    assert row["exit"] == 0, row["note"]
+    truth = json.loads(row["answer"])
+    assert [item["effect"] for item in truth["hidden"]] == ([expected] if expected else [])
+    assert conceal.seal(row["answer"], row["salt"]) == row["commitment"]
+    assert (tmp_path / "sealed").read_text() == f"1 {number} {row['commitment']}\n"
+    assert (row["found"], row["first"], row["extras"]) == ((1, 1, 0) if expected else (0, 0, 0))
+    if expected:
+        assert float(row["error_after"]) <= float(row["error_before"])
+        assert all(abs(p["value"] - p["truth"]) <= 0.05 * abs(p["truth"]) for p in json.loads(row["parameters"]))
