@@ -55,6 +55,10 @@ class Task:
         """Which of the states (N, nq), (N, nv) end an episode: (N,) bool."""
         return np.zeros(len(qpos), bool)
 
+    def observe(self, qpos, qvel):
+        """Observations (N, nobs) of states (N, nq), (N, nv), as gymnasium's _get_obs."""
+        return np.concatenate((qpos[:, self.skip_root_x :], np.clip(qvel, -self.clip_velocity, self.clip_velocity)), axis=1)
+
 
 class InvertedPendulum(Task):
     def unhealthy(self, qpos, qvel):
@@ -209,6 +213,7 @@ class BatchEnv(VectorEnv):
 
         self.batch = Batch(self.model, num_envs, nthread)
         self.qpos, self.qvel, self._ctrl = (self.batch.bind(field) for field in ("qpos", "qvel", "ctrl"))
+        self._peek = None
         self._init_qpos = self.model.qpos0.copy()
         self._rng = [None] * num_envs
         self.steps = np.zeros(num_envs, int)
@@ -221,9 +226,8 @@ class BatchEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def observe(self):
-        """The current observations, (num_envs, nobs), as gymnasium's _get_obs."""
-        velocity = np.clip(self.qvel, -self.task.clip_velocity, self.task.clip_velocity)
-        return np.concatenate((self.qpos[:, self.task.skip_root_x :], velocity), axis=1)
+        """The current observations, (num_envs, nobs)."""
+        return self.task.observe(self.qpos, self.qvel)
 
     def reset(self, *, seed=None, options=None):
         """Start every environment anew; environment i draws from seed + i. Returns (obs, {})."""
@@ -282,6 +286,31 @@ class BatchEnv(VectorEnv):
             self._restart(ids)
             self.obs = self.observe()
         return self.obs.copy(), reward, terminated, truncated, info
+
+    def predict(self, obs, applied):
+        """One step from the states behind obs (num_envs, nobs) under applied: the next observations.
+
+        What an observation leaves out is set to 0 (root x) or taken as it stands (a clipped velocity). The
+        environment must be reset afterwards.
+        """
+        nq = self.model.nq
+        position, velocity = np.split(obs, [nq - self.task.skip_root_x], axis=1)
+        self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self.qpos[:, self.task.skip_root_x :], self.qvel[:] = position, velocity
+        self.batch.forward()
+        self.obs = self.observe()
+        self._ctrl[:] = applied(self.obs) if callable(applied) else applied
+        self.batch.step(nstep=self.task.frame_skip)
+        return self.observe()
+
+    def peek(self, actions):
+        """Where one step under actions would lead from the present states: the next observations; nothing moves."""
+        if self._peek is None:
+            self._peek = Batch(self.model, self.num_envs, self.batch.nthread)
+        self._peek.state[:] = self.batch.state
+        self._peek.ctrl = actions
+        self._peek.step(nstep=self.task.frame_skip)
+        return self.task.observe(self._peek.qpos, self._peek.qvel)
 
     def _reward(self, actions, x_velocity, terminated):
         task = self.task

@@ -1,7 +1,7 @@
 """Trust region policy optimisation (Schulman et al. 2015) with GAE(lambda), for any batched environment.
 
-    learner = TRPO(policy, value, TRPOConfig(), seed=0)
-    learner.learn(env, steps=1_000_000, on_update=print)
+    learner = TRPO(policy, value, TRPOConfig())
+    learner.learn(env, steps=1_000_000, seed=0, on_update=print)
 
 The environment is a gymnasium VectorEnv in SAME_STEP autoreset mode that also hands out info["next_obs"],
 the true successor of every transition. Each update solves
@@ -34,7 +34,8 @@ class TRPOConfig:
     cg_steps: int = 15  # conjugate gradient iterations
     cg_damping: float = 0.1  # added to the Fisher matrix's diagonal
     fisher_every: int = 5  # the Fisher product uses every k-th transition
-    backtracks: int = 10  # halvings tried by the line search
+    backtrack: float = 0.8  # the line search shortens the step by this factor,
+    backtracks: int = 15  # at most so many times
     value_epochs: int = 5  # passes of Adam over the batch for the value function
     value_lr: float = 1e-3
     value_batch: int = 512  # its minibatch
@@ -145,11 +146,11 @@ def policy_update(policy, obs, action, advantage, config):
     if stats["line_search"] == "exhausted":
         with torch.no_grad():
             for k in range(config.backtracks):
-                vector_to_parameters(old + 0.5**k * full_step, policy.parameters())
+                vector_to_parameters(old + config.backtrack**k * full_step, policy.parameters())
                 new_surrogate, kl = surrogate()
                 if torch.isfinite(new_surrogate) and kl <= config.max_kl and new_surrogate > old_surrogate:
                     gain = float(new_surrogate - old_surrogate)
-                    stats.update(kl=float(kl), surrogate_gain=gain, step_size=0.5**k, line_search="accepted")
+                    stats.update(kl=float(kl), surrogate_gain=gain, step_size=config.backtrack**k, line_search="accepted")
                     break
             else:
                 vector_to_parameters(old, policy.parameters())
@@ -192,13 +193,13 @@ def torch_threads(n):
 class TRPO:
     """A policy, its value function, and how they learn.
 
-    Args: policy: GaussianPolicy; value: Value; config: TRPOConfig; seed: of the sampling and the minibatches.
+    Args: policy: GaussianPolicy; value: Value; config: TRPOConfig.
     """
 
-    def __init__(self, policy, value, config, seed=0):
+    def __init__(self, policy, value, config):
         self.policy, self.value, self.config = policy, value, config
         self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr)
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator()
 
     def state(self):
         """What a checkpoint needs to go on learning."""
@@ -210,12 +211,13 @@ class TRPO:
         self.value.load_state_dict(state["value"])
         self.optimizer.load_state_dict(state["optimizer"])
 
-    def learn(self, env, steps, seed=0, freeze_normalizer=True, update_policy=True, on_update=None):
-        """Train on env (reset with seed) for at least `steps` transitions, in whole batches.
+    def learn(self, env, steps, seed, freeze_normalizer=True, update_policy=True, on_update=None):
+        """Train on env for at least `steps` transitions, in whole batches; seed decides every random number.
 
         freeze_normalizer: keep the observation statistics as they are; update_policy=False trains the value
         function alone. on_update(stats) is called with a dict after every update.
         """
+        self.generator.manual_seed(seed)
         obs, _ = env.reset(seed=seed)
         horizon = max(1, self.config.batch_size // env.num_envs)
         adapt = self.config.normalize_obs and not freeze_normalizer
@@ -290,23 +292,49 @@ class EpisodeReturns:
         return self.last
 
 
-def evaluate(policy, env, episodes, seed, deterministic=True):
-    """Undiscounted returns (episodes,) of a policy, one fresh episode per environment of env at a time.
+def rollouts(policy, env, episodes, seed, deterministic=False):
+    """Run `episodes` whole episodes of a policy. Returns their undiscounted returns (episodes,) and Transitions.
 
-    Only each environment's first episode after a reset counts, so that short episodes are not favoured.
+    Each environment plays one episode after each reset, so that short episodes are not favoured.
     """
     generator = torch.Generator().manual_seed(seed)
     low, high = env.single_action_space.low, env.single_action_space.high
-    returns = []
+    returns, rows = [], []
     with torch_threads(1), torch.no_grad():
         while len(returns) < episodes:
             obs, _ = env.reset(seed=seed + len(returns))
-            total, alive = np.zeros(env.num_envs), np.ones(env.num_envs, bool)
+            wanted = np.arange(env.num_envs) < episodes - len(returns)
+            total, alive = np.zeros(env.num_envs), wanted.copy()
             while alive.any():
-                obs = torch.from_numpy(np.asarray(obs, np.float32))
-                action = policy.mean(obs) if deterministic else policy.act(obs, generator)
-                obs, reward, terminated, truncated, _ = env.step(np.clip(action.numpy(), low, high))
+                obs = np.asarray(obs, np.float32)
+                action = policy.mean(torch.from_numpy(obs)) if deterministic else policy.act(torch.from_numpy(obs), generator)
+                action = np.clip(action.numpy(), low, high)
+                before = obs
+                obs, reward, terminated, truncated, info = env.step(action)
+                rows.append((before[alive], action[alive], info["next_obs"][alive].astype(np.float32)))
                 total += reward * alive
                 alive &= ~(terminated | truncated)
-            returns += list(total)
-    return np.array(returns[:episodes])
+            returns += list(total[wanted])
+    return np.array(returns), Transitions(*(np.concatenate(column) for column in zip(*rows)))
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """Real or simulated experience {((s, a), s')}: float32 arrays (N, nobs), (N, nact), (N, nobs)."""
+
+    s: np.ndarray
+    a: np.ndarray
+    s_next: np.ndarray
+
+    def __len__(self):
+        return len(self.s)
+
+    def __getitem__(self, rows):
+        return Transitions(self.s[rows], self.a[rows], self.s_next[rows])
+
+    def __add__(self, other):
+        return Transitions(*(np.concatenate((getattr(self, k), getattr(other, k))) for k in ("s", "a", "s_next")))
+
+    def tensors(self):
+        """The three arrays as torch tensors, sharing memory."""
+        return tuple(torch.from_numpy(x) for x in (self.s, self.a, self.s_next))

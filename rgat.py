@@ -1,0 +1,354 @@
+"""Grounding: ways to make a simulator's transitions look like the real ones by changing the action.
+
+    sim = BatchEnv("Hopper-v4", 32)
+    grounding = RGAT(sim, settings)
+    grounding.fit(tau_real, policy, seed)              # f_psi                        Algorithm 1, line 3
+    grounding.update(policy, at_steps, seed)           # g_phi                        Algorithm 1, line 4
+    grounded = GroundedEnv(sim, grounding.transformer)     # what the policy trains in    Algorithm 1, line 5
+
+An action transformer is any function (s, a) -> a_hat on arrays (N, nobs), (N, nact). Every method of the paper
+is one class with the same two steps.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+from mujoco.batch import Batch
+
+from models import ForwardModel, GaussianPolicy, InverseModel, Value
+from trpo import TRPO, TRPOConfig, rollouts
+
+# section IV-D: the action transformer's own trust region, entropy and discount
+AT_CONFIG = TRPOConfig(batch_size=1024, max_kl=1e-4, entropy=1e-5, gamma=0.99, lam=0.95)
+
+
+def identity(obs, action):
+    """The transformer that changes nothing: the grounded simulator is then the raw one."""
+    return action
+
+
+class GroundedEnv(VectorWrapper):
+    """The grounded simulator (paper, Fig. 2 and 3a): the transformer acts before the sim, the reward sees a, not a_hat."""
+
+    def __init__(self, env, transformer=identity):
+        super().__init__(env)
+        self.transformer = transformer
+
+    def step(self, actions):
+        return self.env.step(actions, applied=self.transformer(self.env.obs, actions))
+
+
+class RealModel:
+    """f_psi as both methods use it: the network, and the guess of s' that it starts from.
+
+    residual: guess where the sim goes; else that the state stays, which is the paper's f_psi of s and a alone.
+    """
+
+    def __init__(self, sim, residual):
+        self.sim, self.residual = sim, residual
+        self.net = ForwardModel(sim.single_observation_space.shape[0], sim.single_action_space.shape[0])
+
+    def fit(self, tau_real, seed):
+        """Fit to real Transitions, the sim started in each of their states. Returns the held-out RMS error."""
+        torch.manual_seed(seed)
+        self.net = ForwardModel(*(space.shape[0] for space in (self.sim.single_observation_space, self.sim.single_action_space)))
+        seen = tau_real if not self.residual else tau_real[measured(self.sim, tau_real.s)]
+        guess = predict_all(self.sim, seen) if self.residual else seen.s
+        s, a, s_next = seen.tensors()
+        return self.net.fit(s, a, s_next, torch.from_numpy(guess), torch.Generator().manual_seed(seed))
+
+    @torch.no_grad()
+    def __call__(self, s, a):
+        """f_psi(s, a) (N, nobs) float32, s being the sim's present observations."""
+        s, a = np.asarray(s, np.float32), np.asarray(a, np.float32)
+        guess = self.sim.peek(a).astype(np.float32) if self.residual else s
+        predicted = self.net(*(torch.from_numpy(x) for x in (s, a, guess))).numpy()
+        # a state that the observation does not show in full was never fitted: there the sim's word stands
+        return np.where(measured(self.sim, s)[:, None], predicted, guess) if self.residual else predicted
+
+
+def measured(sim, s):
+    """Which observations (N, nobs) show all of qvel: (N,) bool. Hopper's are clipped to +-10."""
+    return (np.abs(s[:, -sim.model.nv :]) < sim.task.clip_velocity).all(axis=1)
+
+
+def predict_all(sim, transitions):
+    """Where the sim goes from every (s, a) of the Transitions: (N, nobs) float32."""
+    n, width = len(transitions), sim.num_envs
+    after = []
+    for first in range(0, n, width):
+        fill = np.arange(first, first + width) % n
+        after.append(sim.predict(transitions.s[fill].astype(float), transitions.a[fill]))
+    return np.concatenate(after)[:n].astype(np.float32)
+
+
+class ActionTransformer:
+    """g_phi as it is used for policy improvement: a_hat = a + delta_a, delta_a the mean of a Gaussian policy.
+
+    The policy's output is in units of the action range, so that 1 reaches from one bound to the other.
+    """
+
+    def __init__(self, policy, low, high):
+        self.policy, self.low, self.high = policy, low, high
+
+    @torch.no_grad()
+    def __call__(self, obs, action):
+        sa = torch.from_numpy(np.concatenate((obs, action), axis=1).astype(np.float32))
+        return self.apply(action, self.policy.mean(sa).numpy())
+
+    def apply(self, action, output):
+        """a_hat for the Gaussian policy's output."""
+        return np.clip(action + (self.high - self.low) * output, self.low, self.high)
+
+
+class ActionTransformerEnv(VectorEnv):
+    """The grounding step as a reinforcement learning problem (paper, section III and Fig. 3b).
+
+    The agent is g_phi: it observes (s, a), a ~ pi_theta(s), chooses delta_a, and is paid
+    R_AT = -||f_psi(s, a) - s'||^2. The target policy and the sim are its environment. R_AT is never positive,
+    so an agent that could end episodes would learn to: the task's falls are handed out as truncations, which
+    TRPO bootstraps like time limits.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(self, sim, transformer, policy, real_model, seed):
+        self.sim, self.transformer, self.policy, self.real_model = sim, transformer, policy, real_model
+        self.num_envs = sim.num_envs
+        nobs, nact = sim.single_observation_space.shape[0], sim.single_action_space.shape[0]
+        self.single_observation_space = Box(-np.inf, np.inf, (nobs + nact,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (nact,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def _with_action(self, s):
+        s = s.astype(np.float32)
+        a = self.policy.act(torch.from_numpy(s), self.generator).numpy()
+        box = self.sim.single_action_space
+        return np.concatenate((s, np.clip(a, box.low, box.high)), axis=1)
+
+    def reset(self, *, seed=None, options=None):
+        self.sa = self._with_action(self.sim.reset(seed=seed)[0])
+        return self.sa.copy(), {}
+
+    def step(self, output):
+        s, a = np.split(self.sa, [self.sim.single_observation_space.shape[0]], axis=1)
+        predicted = self.real_model(s, a)
+        obs, _, terminated, truncated, info = self.sim.step(a, applied=self.transformer.apply(a, output))
+        reward = -((predicted - info["next_obs"]) ** 2).sum(axis=1)
+        next_sa = self._with_action(info["next_obs"])
+        done = terminated | truncated
+        self.sa = next_sa.copy()
+        if done.any():
+            self.sa[done] = self._with_action(obs)[done]
+        return self.sa.copy(), reward, np.zeros_like(done), done, {"next_obs": next_sa}
+
+
+# --- the methods -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class GroundingSettings:
+    """What the grounding methods can be told; defaults are the paper's where it gives them."""
+
+    at: TRPOConfig = AT_CONFIG  # rgat: TRPO for the action transformer
+    at_std: float = 0.03  # rgat: its initial standard deviation, in units of the action range
+    residual: bool = True  # rgat and gat: f_psi corrects the sim's own prediction
+    smoothing: float = 0.95  # gat: a_hat = smoothing * g(s, a) + (1 - smoothing) * a
+    ane_width: float = 0.2  # ane: standard deviation of the action noise, in units of half the action range
+
+
+class Grounding:
+    """No grounding: the policy goes on learning in the world it is given (the `sim` and `real` lines)."""
+
+    learns_from_real = False
+
+    def __init__(self, sim, settings=GroundingSettings()):
+        self.sim, self.settings = sim, settings
+        self.low, self.high = sim.single_action_space.low, sim.single_action_space.high
+        self.nobs, self.nact = sim.single_observation_space.shape[0], sim.single_action_space.shape[0]
+        self.transformer = identity
+
+    def fit(self, tau_real, policy, seed):
+        """Line 3: learn a model of the real dynamics. Returns statistics for progress.csv."""
+        return {}
+
+    def update(self, policy, steps, seed, on_update=None):
+        """Line 4: renew self.transformer with up to `steps` transitions in the sim. Returns statistics."""
+        return {}
+
+    def state(self):
+        """Tensors that a checkpoint needs to rebuild the transformer."""
+        return {}
+
+    def load(self, state):
+        """Take over what state() returned."""
+
+
+class RGAT(Grounding):
+    """The paper's method: g_phi learnt end to end by TRPO on R_AT; f_psi enters the reward alone."""
+
+    learns_from_real = True
+
+    def __init__(self, sim, settings=GroundingSettings()):
+        super().__init__(sim, settings)
+        self.real_model = RealModel(sim, settings.residual)
+        self._new_transformer()
+
+    def fit(self, tau_real, policy, seed):
+        self.seen = tau_real
+        return {"forward_model_error": self.real_model.fit(tau_real, seed)}
+
+    def update(self, policy, steps, seed, on_update=None):
+        """g_phi goes on from the last grounding step, as Algorithm 1 has it: at max KL 1e-4 one step's updates are few."""
+        if not self.learner.value.normalizer.count:
+            torch.manual_seed(seed)
+            self._new_transformer()
+            sa = torch.from_numpy(np.concatenate((self.seen.s, self.seen.a), axis=1))
+            for network in (self.learner.policy, self.learner.value):
+                network.normalizer.update(sa)
+        env = ActionTransformerEnv(self.sim, self.transformer, policy, self.real_model, seed)
+        kls = []
+        self.learner.learn(env, steps, seed, on_update=lambda stats: (kls.append(stats["kl"]), on_update and on_update(stats)))
+        std = self.learner.policy.log_std.detach().exp().numpy() * (self.high - self.low)
+        return {"at_std": float(std.mean()), "kl": float(np.mean(kls))}
+
+    def _new_transformer(self):
+        policy = GaussianPolicy(self.nobs + self.nact, self.nact, log_std=np.log(self.settings.at_std))
+        self.learner = TRPO(policy, Value(self.nobs + self.nact), self.settings.at)
+        self.transformer = ActionTransformer(policy, self.low, self.high)
+
+    def state(self):
+        return {"at": self.learner.state(), "forward_model": self.real_model.net.state_dict()}
+
+    def load(self, state):
+        self.learner.load(state["at"])
+        self.real_model.net.load_state_dict(state["forward_model"])
+
+
+class GAT(Grounding):
+    """Hanna and Stone 2017: g(s, a) = f_sim^-1(s, f_real(s, a)), each learnt by itself (paper, section II-C)."""
+
+    learns_from_real = True
+
+    def __init__(self, sim, settings=GroundingSettings()):
+        super().__init__(sim, settings)
+        self.real_model = RealModel(sim, settings.residual)
+        self.inverse_model = InverseModel(self.nobs, self.nact)
+
+    def fit(self, tau_real, policy, seed):
+        self.seen = tau_real
+        return {"forward_model_error": self.real_model.fit(tau_real, seed)}
+
+    def update(self, policy, steps, seed, on_update=None):
+        """f_sim^-1 from as many transitions in the sim as the real data holds, but at least `steps` of them."""
+        episodes, tau_sim = 0, None
+        while tau_sim is None or len(tau_sim) < min(steps, len(self.seen)):
+            more = rollouts(policy, self.sim, self.sim.num_envs, seed + episodes)[1]
+            tau_sim, episodes = more if tau_sim is None else tau_sim + more, episodes + self.sim.num_envs
+        s, a, s_next = tau_sim.tensors()
+        torch.manual_seed(seed)
+        self.inverse_model = InverseModel(self.nobs, self.nact)
+        self.inverse_model.fit(s, s_next, a, torch.Generator().manual_seed(seed))
+        self.transformer = self._transform
+        return {"sim_transitions": len(tau_sim)}
+
+    @torch.no_grad()
+    def _transform(self, obs, action):
+        s_next = torch.from_numpy(self.real_model(obs, action))
+        a_hat = self.inverse_model(torch.from_numpy(obs.astype(np.float32)), s_next).numpy()
+        smoothing = self.settings.smoothing
+        return np.clip(smoothing * a_hat + (1 - smoothing) * action, self.low, self.high)
+
+    def state(self):
+        return {"inverse_model": self.inverse_model.state_dict(), "forward_model": self.real_model.net.state_dict()}
+
+    def load(self, state):
+        self.inverse_model.load_state_dict(state["inverse_model"])
+        self.real_model.net.load_state_dict(state["forward_model"])
+        self.transformer = self._transform
+
+
+class ANE(Grounding):
+    """Action noise envelope (Jakobi 1995): no grounding, but a policy made robust by noise on its actions."""
+
+    def update(self, policy, steps, seed, on_update=None):
+        rng = np.random.default_rng(seed)
+        std = self.settings.ane_width * (self.high - self.low) / 2
+
+        def noisy(obs, action):
+            return np.clip(action + std * rng.standard_normal(action.shape), self.low, self.high)
+
+        self.transformer = noisy
+        return {}
+
+
+class Oracle(Grounding):
+    """The ceiling of action transformation: the delta_a that best imitates the true real model, step by step.
+
+    A Gauss-Newton step on ||s'_sim(a_hat) - s'_real(a)||^2, whole, halved or not at all, whichever lands
+    nearest; derivatives by finite differences in a batch, from the sim's full state. It knows the real model,
+    which no method may: it tells what a perfect g_phi could do.
+    """
+
+    epsilon = 0.05  # finite difference, in units of the action range
+
+    def __init__(self, sim, settings=GroundingSettings(), real_model=None):
+        super().__init__(sim, settings)
+        nthread = sim.batch.nthread
+        self.real_batch = Batch(real_model, sim.num_envs, nthread)
+        self.probe = Batch(sim.model, sim.num_envs * (1 + self.nact), nthread)
+        self.trial = Batch(sim.model, sim.num_envs * 2, nthread)
+        self.transformer = self._transform
+
+    def _after(self, batch, actions):
+        """Observations (n, k, nobs) one step after the sim's present states under actions (n, k, nact)."""
+        n, k, _ = actions.shape
+        batch.state[:] = np.repeat(self.sim.batch.state, k, axis=0)
+        batch.ctrl = actions.reshape(n * k, -1)
+        batch.step(nstep=self.sim.task.frame_skip)
+        return self.sim.task.observe(batch.qpos, batch.qvel).reshape(n, k, -1)
+
+    def _transform(self, obs, action):
+        span = self.high - self.low
+        action = np.clip(action, self.low, self.high).astype(float)
+        target = self._after(self.real_batch, action[:, None])
+        # probe towards the middle, so that no probe leaves the actuator's range
+        reach = self.epsilon * span * np.where(action > (self.high + self.low) / 2, -1.0, 1.0)
+        probes = np.concatenate((action[:, None], action[:, None] + reach[:, None] * np.eye(self.nact)), axis=1)
+        after = self._after(self.probe, probes)
+        residual = target - after[:, :1]
+        jacobian = (after[:, 1:] - after[:, :1]) / reach[..., None]
+        normal = np.einsum("naj,nbj->nab", jacobian, jacobian) + 1e-9 * np.eye(self.nact)
+        step = np.linalg.solve(normal, np.einsum("naj,nj->na", jacobian, residual[:, 0])[..., None])[..., 0]
+        trials = np.clip(action[:, None] + np.stack((step, step / 2), axis=1), self.low, self.high)
+        errors = np.concatenate((residual, target - self._after(self.trial, trials)), axis=1)
+        choices = np.concatenate((action[:, None], trials), axis=1)
+        return choices[np.arange(len(action)), (errors**2).sum(axis=2).argmin(axis=1)]
+
+
+METHODS = {"rgat": RGAT, "gat": GAT, "ane": ANE, "oracle": Oracle, "sim": Grounding, "real": Grounding}
+
+
+def one_step_error(env, transformer, transitions, limit=4096):
+    """How far the sim under a transformer lands from where the real world did.
+
+    Returns (RMS of ||s'_real - s'_sim||, RMS of ||a_hat - a||) over up to `limit` real transitions. Rows whose
+    velocities the observation clipped are left out: their state is not known.
+    """
+    rows = np.flatnonzero(measured(env, transitions.s))
+    rows = rows[np.linspace(0, len(rows) - 1, min(limit, len(rows))).astype(int)]
+    miss, change = [], []
+    for part in np.array_split(rows, -(-len(rows) // env.num_envs)):
+        fill = np.resize(part, env.num_envs)  # a batch has one size: repeat rows, then drop the repeats
+        s, a, s_next = (x[fill].astype(float) for x in (transitions.s, transitions.a, transitions.s_next))
+        a_hat = []
+        after = env.predict(s, lambda obs: a_hat.append(transformer(obs, a)) or a_hat[0])
+        miss.append(((after - s_next) ** 2).sum(axis=1)[: len(part)])
+        change.append(((a_hat[0] - a) ** 2).sum(axis=1)[: len(part)])
+    return tuple(float(np.sqrt(np.concatenate(x).mean())) for x in (miss, change))

@@ -1,0 +1,251 @@
+"""A run on disk: settings, tables, checkpoints, figure and animation; everything is written whole or not at all."""
+
+import csv
+import io
+import json
+import os
+import platform
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
+
+from models import load_checkpoint
+
+PROGRESS = (
+    "grounding_step real_transitions sim_steps real_return_deterministic real_return_deterministic_se "
+    "real_return_stochastic forward_model_error at_one_step_error identity_one_step_error delta_action_rms at_std kl seconds"
+).split()
+TRAIN = (
+    "grounding_step phase steps return reward kl surrogate_gain step_size line_search entropy explained_variance std"
+).split()
+
+
+class RunError(ValueError):
+    """A run folder that cannot be used as asked; the message says what to do instead."""
+
+
+def write_whole(path, data):
+    """Write bytes or text under a temporary name, then rename: a reader never sees half a file."""
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with open(partial, "wb") as file:
+            file.write(data.encode() if isinstance(data, str) else data)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise RunError(f"cannot write {path}: {error.strerror}; free space or choose another --out") from None
+
+
+def save_whole(path, tensors):
+    """torch.save in the manner of write_whole."""
+    data = io.BytesIO()
+    torch.save(tensors, data)
+    write_whole(path, data.getvalue())
+
+
+def versions():
+    """What the numbers of a run depend on besides its settings."""
+    packages = {"mujoco": mujoco.__version__, "gymnasium": gymnasium.__version__, "torch": torch.__version__, "numpy": np.__version__}
+    return {"python": platform.python_version(), **packages, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+
+
+class Run:
+    """The folder of one run.
+
+    config.json, progress.csv (a row per grounding step), train.csv (a row per TRPO update), step_NN.pt
+    (checkpoints), real_NN.npz (the real transitions collected before step NN), policy.pt (the best policy so
+    far on real), progress.png.
+    """
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+        self.progress, self.train = [], []
+        self.lines = {}
+
+    @classmethod
+    def create(cls, folder, settings):
+        """A new folder for a run with these settings (a dict). Raises RunError if it holds a run or cannot be made."""
+        run = cls(folder)
+        if (run.folder / "config.json").exists():
+            raise RunError(f"{folder} already holds a run: continue it with --resume {folder}, or choose another --out")
+        try:
+            run.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RunError(f"cannot make the folder {folder}: {error.strerror}; choose another --out") from None
+        write_whole(run.folder / "config.json", json.dumps({"settings": settings, "versions": versions()}, indent=1))
+        return run
+
+    @classmethod
+    def open(cls, folder):
+        """An existing run, cut back to its last whole grounding step. Returns it and its settings."""
+        run = cls(folder)
+        try:
+            config = json.loads((run.folder / "config.json").read_text())
+            settings = config["settings"]
+            run.progress = run._read("progress.csv")
+            done = len(run.progress)
+            run.train = [row for row in run._read("train.csv") if int(row["grounding_step"]) < done]
+            if (run.folder / "lines.json").exists():
+                run.lines = json.loads((run.folder / "lines.json").read_text())
+        except FileNotFoundError:
+            raise RunError(f"{folder} holds no run (no config.json): name the --out folder of an earlier run") from None
+        except (ValueError, KeyError, TypeError, OSError):
+            raise RunError(f"{folder}: its config.json or tables are damaged: start a new run") from None
+        return run, settings
+
+    def _read(self, name):
+        path = self.folder / name
+        return list(csv.DictReader(path.open(newline=""))) if path.exists() else []
+
+    def _table(self, name, columns, rows):
+        text = io.StringIO()
+        writer = csv.DictWriter(text, columns, extrasaction="ignore", restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+        write_whole(self.folder / name, text.getvalue())
+
+    def log_update(self, grounding_step, phase, stats):
+        """Keep a row of train.csv; flush() writes it."""
+        self.train.append({"grounding_step": grounding_step, "phase": phase, **stats})
+
+    def flush(self):
+        """Bring train.csv and the figure up to date."""
+        self._table("train.csv", TRAIN, self.train)
+        self.plot()
+
+    def record(self, row, checkpoint, real=None):
+        """Finish a grounding step: its checkpoint first, its progress row last, so that a row means a whole step."""
+        step = row["grounding_step"]
+        if real is not None:
+            data = io.BytesIO()
+            np.savez(data, s=real.s, a=real.a, s_next=real.s_next)
+            write_whole(self.folder / f"real_{step:02d}.npz", data.getvalue())
+        save_whole(self.folder / f"step_{step:02d}.pt", checkpoint)
+        best = max([float(r["real_return_deterministic"]) for r in self.progress], default=-np.inf)
+        if row["real_return_deterministic"] > best:
+            save_whole(self.folder / "policy.pt", checkpoint["acting"])
+        self.progress.append({k: row.get(k, "") for k in PROGRESS})
+        self._table("train.csv", TRAIN, self.train)
+        self._table("progress.csv", PROGRESS, self.progress)
+        self.plot()
+
+    def checkpoint(self, step):
+        """What record() saved for a step. Raises RunError if it is missing or damaged."""
+        try:
+            return load_checkpoint(self.folder / f"step_{step:02d}.pt")
+        except ValueError as error:
+            raise RunError(f"{error}; start a new run") from None
+
+    def real(self, step):
+        """The arrays s, a, s_next collected before a step, or None."""
+        path = self.folder / f"real_{step:02d}.npz"
+        if not path.exists():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                return data["s"], data["a"], data["s_next"]
+        except (ValueError, KeyError, OSError) as error:
+            raise RunError(f"{path} is damaged ({type(error).__name__}): start a new run") from None
+
+    def set_lines(self, **lines):
+        """Remember the reference returns drawn as horizontal lines."""
+        self.lines.update(lines)
+        write_whole(self.folder / "lines.json", json.dumps(self.lines, indent=1))
+
+    def plot(self):
+        """progress.png: return on real against grounding step, and the training returns behind it."""
+        figure = Figure(figsize=(10, 4), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        steps = [int(r["grounding_step"]) for r in self.progress]
+        mean = np.array([float(r["real_return_deterministic"]) for r in self.progress])
+        se = np.array([float(r["real_return_deterministic_se"]) for r in self.progress])
+        if steps:
+            left.errorbar(steps, mean, se, color="#1f5fa8", marker="o", capsize=3, label="on real, deterministic")
+            left.plot(steps, [float(r["real_return_stochastic"]) for r in self.progress], color="#1f5fa8", ls=":", label="on real, stochastic")
+        for (name, value), color in zip(self.lines.items(), ("#c0392b", "#2e8b57")):
+            left.axhline(value, color=color, lw=1.2, label=name)
+        left.set(xlabel="grounding step", ylabel="return on real")
+        left.xaxis.get_major_locator().set_params(integer=True)
+        if left.get_legend_handles_labels()[0]:
+            left.legend(fontsize=8)
+        rows = [r for r in self.train if r["phase"] != "transformer" and str(r["return"]) not in ("", "nan")]
+        offset, last, x = 0, 0, []
+        for row in rows:  # steps restart with every phase
+            offset += last if int(row["steps"]) < last else 0
+            last = int(row["steps"])
+            x.append(offset + last)
+        right.plot(x, [float(r["return"]) for r in rows], color="#666666", lw=1)
+        right.set(xlabel="steps of policy improvement", ylabel="return in training (stochastic)")
+        image = io.BytesIO()
+        figure.savefig(image, format="png", dpi=110)
+        write_whole(self.folder / "progress.png", image.getvalue())
+
+
+# --- replay: the planar robots drawn from their geoms, with no need of OpenGL ------------------------
+
+
+def draw(model, data, x, title, size=(400, 300), scale=110):
+    """One frame: every capsule of the model projected on the x-z plane, the camera at x."""
+    image = Image.new("RGB", size, "#f7f7f4")
+    pen = ImageDraw.Draw(image)
+    to_pixel = lambda p: (size[0] / 2 + scale * (p[0] - x), size[1] * 0.82 - scale * p[2])
+    ground = to_pixel((0, 0, 0))[1]
+    pen.rectangle((0, ground, *size), fill="#dcd9cf")
+    for mark in np.arange(np.floor(x) - 3, x + 4, 0.5):
+        pen.line((to_pixel((mark, 0, 0)), (to_pixel((mark, 0, 0))[0], ground + 6)), fill="#8f8b80")
+    for geom in range(model.ngeom):
+        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
+            continue
+        radius, half = model.geom_size[geom, :2]
+        axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * half
+        ends = [to_pixel(data.geom_xpos[geom] + sign * axis) for sign in (-1, 1)]
+        color = "#8f8b80" if model.geom_bodyid[geom] == 0 else "#1f5fa8"
+        pen.line(ends, fill=color, width=max(1, round(2 * radius * scale)))
+        for px, pz in ends:
+            r = radius * scale
+            pen.ellipse((px - r, pz - r, px + r, pz + r), fill=color)
+    pen.text((8, 6), title, fill="#222222")
+    return image
+
+
+def animate(policy, worlds, path, seed=0, max_steps=500, every=4):
+    """A GIF of a policy acting in each of the worlds {title: BatchEnv with one environment}, side by side.
+
+    Each world stops moving when its episode ends. Returns the returns reached within max_steps, by title.
+    """
+    strips, returns = [], {}
+    for title, env in worlds.items():
+        obs, _ = env.reset(seed=seed)
+        data, frames, total, ended = mujoco.MjData(env.model), [], 0.0, False
+        for step in range(max_steps):
+            if step % every == 0:
+                if not ended:
+                    data.qpos[:] = env.qpos[0]
+                    mujoco.mj_kinematics(env.model, data)
+                x = 0.0 if not env.task.skip_root_x else data.qpos[0]
+                frames.append(draw(env.model, data, x, f"{title}: return {total:.0f}{', fallen' if ended else ''}"))
+            if not ended:
+                with torch.no_grad():
+                    action = policy.mean(torch.from_numpy(obs.astype(np.float32))).numpy()
+                box = env.single_action_space
+                obs, reward, terminated, truncated, _ = env.step(np.clip(action, box.low, box.high))
+                total, ended = total + float(reward[0]), bool(terminated[0] or truncated[0])
+        strips.append(frames)
+        returns[title] = total
+    frames = []
+    for parts in zip(*strips):
+        frame = Image.new("RGB", (sum(p.width for p in parts), parts[0].height))
+        for i, part in enumerate(parts):
+            frame.paste(part, (i * part.width, 0))
+        frames.append(frame.quantize(64))
+    env = next(iter(worlds.values()))
+    gif = io.BytesIO()
+    frames[0].save(gif, "GIF", save_all=True, append_images=frames[1:], loop=0, duration=max(20, int(1000 * env.dt * every)))
+    write_whole(path, gif.getvalue())
+    return returns

@@ -1,0 +1,342 @@
+"""Train a policy in simulation that works on the "real" robot: Algorithm 1 of the RGAT paper, and its rivals.
+
+    python train.py --env Hopper-v4 --algo rgat
+    python train.py --env InvertedPendulum-v4 --algo gat --seed 3 --out runs/pendulum
+    python train.py --resume runs/pendulum
+    python train.py --replay runs/pendulum
+"""
+
+import argparse
+import hashlib
+import json
+import dataclasses
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from envs import BatchEnv, EnvError, parse_perturbation, task_of
+from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint
+from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, identity, one_step_error
+from runs import Run, RunError, animate, save_whole, versions, write_whole
+from trpo import PRESETS, TRPO, Transitions, rollouts
+
+# settings that suit each task, where the command line does not say
+DEFAULTS = {
+    "InvertedPendulum": {"pretrain_steps": 100_000, "grounding_steps": 10, "at_steps": 100_000, "policy_steps": 50_000, "at_std": 0.14},
+    "Hopper": {"pretrain_steps": 1_000_000, "grounding_steps": 10, "at_steps": 200_000, "policy_steps": 250_000, "at_std": 0.03},
+    "HalfCheetah": {"pretrain_steps": 1_000_000, "grounding_steps": 20, "at_steps": 200_000, "policy_steps": 250_000, "at_std": 0.03},
+}
+
+
+def option(default, help, **extra):
+    return field(default=default, metadata={"help": help, **extra})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that decides a run's numbers, but for --out."""
+
+    env: str = option("Hopper-v4", "task: InvertedPendulum, Hopper or HalfCheetah, -v4 or -v5")
+    algo: str = option("rgat", "how to ground: rgat, gat, ane, oracle; sim and real train in that world alone", choices=list(METHODS))
+    seed: int = option(0, "seed of everything random")
+    real: str = option(None, "what makes the real world differ, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)")
+    policy: str = option("deep", "hidden layers of the target policy: deep 2x64, shallow 1x4", choices=["deep", "shallow"])
+    pretrain_steps: int = option(None, "steps in the raw sim before the first grounding step (default: by task)")
+    grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
+    real_trajectories: int = option(50, "real episodes recorded per grounding step")
+    at_steps: int = option(None, "sim steps per grounding step for the action transformer (default: by task)")
+    policy_steps: int = option(None, "grounded-sim steps per grounding step for the policy (default: by task)")
+    eval_episodes: int = option(20, "real episodes per evaluation, deterministic and again stochastic")
+    num_envs: int = option(32, "simulations stepped at once")
+    at_max_kl: float = option(AT_CONFIG.max_kl, "rgat: trust region of the action transformer")
+    at_gamma: float = option(AT_CONFIG.gamma, "rgat: discount of the action transformer")
+    at_entropy: float = option(AT_CONFIG.entropy, "rgat: entropy coefficient of the action transformer")
+    at_std: float = option(None, "rgat: its initial standard deviation, as a part of the action range (default: by task)")
+    forward_model: str = option("residual", "rgat, gat: f_psi corrects the sim's own prediction, or is the paper's network of (s, a) alone", choices=["residual", "plain"])
+    threads: int = option(0, "cores that this run may take (default: all); seeds side by side do best with 1 each")
+    pretrained: str = option("", "folder that keeps policies trained from scratch, for other runs to share")
+    ane_width: float = option(GroundingSettings.ane_width, "ane: standard deviation of the action noise, as a part of half the action range")
+
+    def completed(self):
+        """These settings with the task's defaults filled in. Raises EnvError or RunError for impossible ones."""
+        task = task_of(self.env)
+        defaults = {**DEFAULTS[self.env.split("-")[0]], "real": task.real}
+        done = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
+        for name, least in COUNTS.items():
+            if getattr(done, name) < least:
+                raise RunError(f"--{name.replace('_', '-')} is {getattr(done, name)}: it must be at least {least}")
+        for name in ("at_max_kl", "at_std"):
+            if not 0 < getattr(done, name) < np.inf:
+                raise RunError(f"--{name.replace('_', '-')} is {getattr(done, name)}: it must be positive")
+        if not 0 <= done.at_gamma < 1:
+            raise RunError(f"--at-gamma is {done.at_gamma}: it must be at least 0 and below 1")
+        if not 0 <= done.ane_width < np.inf or not 0 <= done.at_entropy < np.inf:
+            raise RunError("--ane-width and --at-entropy must be 0 or more")
+        parse_perturbation(done.real)
+        return done
+
+
+COUNTS = {
+    "seed": 0, "pretrain_steps": 0, "grounding_steps": 0, "real_trajectories": 1, "at_steps": 1, "policy_steps": 0, "eval_episodes": 1, "num_envs": 1, "threads": 0
+}  # fmt: skip
+
+
+def seed_for(seed, step, purpose):
+    """An independent seed for each use in each grounding step, so that a resumed run draws the same numbers."""
+    purposes = ("networks", "pretrain", "collect", "model", "transformer", "held out", "policy", "evaluate", "best")
+    return int(np.random.SeedSequence([seed, step, purposes.index(purpose)]).generate_state(1)[0] >> 1)
+
+
+# --- Algorithm 1 --------------------------------------------------------------------------------------
+
+
+def algorithm_1(s, run, bar):
+    """Algorithm 1 of the paper under settings s. Its results are left in run; a run begun earlier goes on."""
+    if s.threads:
+        torch.set_num_threads(s.threads)
+    sim = BatchEnv(s.env, s.num_envs, nthread=s.threads)
+    real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=s.threads)
+    learner, grounding, tau_real = start(s, run, sim, real, bar)
+    policy = learner.policy
+
+    for step in range(len(run.progress), s.grounding_steps + 1):  # 1: while the policy improves on real
+        seeds = lambda purpose: seed_for(s.seed, step, purpose)
+        tau_new = collect(s, grounding, policy, real, seeds("collect"))  # 2: collect tau_real
+        tau_real += tau_new
+        stats = grounding.fit(tau_real, policy, seeds("model"))  # 3: train f_psi with tau_real
+        stats |= grounding.update(policy, s.at_steps, seeds("transformer"), bar.phase(step, "transformer"))  # 4: update g_phi
+        stats |= errors(s, sim, grounding, real, policy, seeds("held out"))
+        grounded_sim = GroundedEnv(grounding.sim, grounding.transformer)
+        learner.learn(grounded_sim, s.policy_steps, seeds("policy"), on_update=bar.phase(step, "policy"))  # 5: update pi_theta
+        record(s, run, step, learner, grounding, real, tau_new, stats, bar)  # 6: end while; the run keeps the best policy
+
+
+def collect(s, grounding, policy, real, seed):
+    """tau_real of one grounding step: episodes of the stochastic policy, for the methods that learn from them."""
+    if not grounding.learns_from_real:
+        return nothing(real)
+    return rollouts(policy, real, s.real_trajectories, seed)[1]
+
+
+def nothing(env):
+    """Transitions of length 0."""
+    obs, act = np.empty((0, env.single_observation_space.shape[0]), np.float32), np.empty((0, env.single_action_space.shape[0]), np.float32)
+    return Transitions(obs, act, obs)
+
+
+def errors(s, sim, grounding, real, policy, seed):
+    """One-step errors with the transformer and without, on real transitions that nothing was fitted on."""
+    held_out = rollouts(policy, real, s.eval_episodes, seed)[1]
+    error, change = one_step_error(grounding.sim, grounding.transformer, held_out)
+    return {"at_one_step_error": error, "identity_one_step_error": one_step_error(sim, identity, held_out)[0], "delta_action_rms": change}
+
+
+def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
+    """Judge the policy on real, and write down everything that the next step, or a resumed run, needs."""
+    seed = seed_for(s.seed, step, "evaluate")
+    deterministic = rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)[0]
+    stochastic = rollouts(learner.policy, real, s.eval_episodes, seed)[0]
+    before = run.progress[-1] if run.progress else {"real_transitions": 0, "sim_steps": 0, "seconds": 0}
+    steps, seconds = bar.lap()
+    on_real = s.algo == "real"
+    row = {
+        "grounding_step": step,
+        "real_transitions": int(before["real_transitions"]) + (steps if on_real else len(tau_new)),
+        "sim_steps": int(before["sim_steps"]) + (0 if on_real else steps + stats.get("sim_transitions", 0)),
+        "real_return_deterministic": float(deterministic.mean()),
+        "real_return_deterministic_se": standard_error(deterministic),
+        "real_return_stochastic": float(stochastic.mean()),
+        **stats,
+        "seconds": round(float(before["seconds"]) + seconds, 1),
+    }
+    acting = {"sizes": list(learner.policy.sizes), "state": learner.policy.state_dict()}
+    run.record(row, {"learner": learner.state(), "grounding": grounding.state(), "acting": acting}, tau_new)
+    bar.say(f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real")
+
+
+def standard_error(x):
+    return float(x.std(ddof=1) / np.sqrt(len(x))) if len(x) > 1 else 0.0
+
+
+# --- where a run begins -------------------------------------------------------------------------------
+
+
+def start(s, run, sim, real, bar):
+    """The learner, the grounding and tau_real that the next grounding step goes on from; step 0 if there is none yet."""
+    world = real if s.algo == "real" else sim
+    method = METHODS[s.algo]
+    settings = GroundingSettings(
+        at=dataclasses.replace(AT_CONFIG, max_kl=s.at_max_kl, gamma=s.at_gamma, entropy=s.at_entropy), at_std=s.at_std, residual=s.forward_model == "residual", ane_width=s.ane_width
+    )
+    grounding = method(world, settings, real.model) if s.algo == "oracle" else method(world, settings)
+    learner = new_learner(s)
+    tau_real = nothing(real)
+    done = len(run.progress) - 1
+    if done >= 0:
+        saved = run.checkpoint(done)
+        try:
+            learner.load(saved["learner"])
+            if done:
+                grounding.load(saved["grounding"])
+        except (KeyError, RuntimeError, TypeError, ValueError):
+            raise RunError(f"{run.folder}/step_{done:02d}.pt does not belong to this run: start a new one") from None
+        for step in range(1, done + 1):
+            tau_real += Transitions(*run.real(step))
+        bar.skip(sum(int(run.progress[-1][k]) for k in ("sim_steps", "real_transitions") if k == "sim_steps" or s.algo == "real"))
+        bar.lap()
+        return learner, grounding, tau_real
+
+    learner.load(pretrained(s, "real" if s.algo == "real" else "sim", world, bar))
+    record(s, run, 0, learner, grounding, real, tau_real, {}, bar)
+    own = run.progress[0]["real_return_deterministic"]
+    if s.algo == "real":
+        run.set_lines(**{"trained on real": own})
+    else:
+        reference = new_learner(s)
+        reference.load(pretrained(s, "real", real, bar))
+        returns = rollouts(reference.policy, real, s.eval_episodes, seed_for(s.seed, 0, "evaluate"), deterministic=True)[0]
+        run.set_lines(**{"trained in sim": own, "trained on real": float(returns.mean())})
+    return learner, grounding, tau_real
+
+
+def new_learner(s):
+    """Untrained policy and value in their TRPO, with the task's preset."""
+    torch.manual_seed(seed_for(s.seed, 0, "networks"))
+    env = BatchEnv(s.env, 1)
+    nobs, nact = env.single_observation_space.shape[0], env.single_action_space.shape[0]
+    policy = GaussianPolicy(nobs, nact, {"deep": DEEP, "shallow": SHALLOW}[s.policy])
+    return TRPO(policy, Value(nobs), PRESETS[s.env.split("-")[0]])
+
+
+def pretrained(s, world, env, bar):
+    """TRPO from scratch in a world ("sim" or "real"): the learner's state, shared by all runs that name one --pretrained folder."""
+    decides = [s.env, s.real if world == "real" else "", s.policy, s.seed, s.pretrain_steps, s.num_envs, PRESETS[s.env.split("-")[0]], versions()]
+    key = hashlib.sha256(repr(decides).encode()).hexdigest()[:16]
+    path = Path(s.pretrained) / f"{s.env}-{world}-{key}.pt" if s.pretrained else None
+    if path and path.exists():
+        bar.skip(s.pretrain_steps)
+        return load_checkpoint(path)
+    learner = new_learner(s)
+    learner.learn(
+        env, s.pretrain_steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=bar.phase(0, "pretrain" if world == s.algo or world == "sim" else "reference")
+    )
+    if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_whole(path, learner.state())
+    return learner.state()
+
+
+# --- the command line ---------------------------------------------------------------------------------
+
+
+class Bar:
+    """Progress on a terminal, train.csv and the figure along the way, and the steps and seconds of each grounding step."""
+
+    def __init__(self, s, run):
+        self.run, self.seen, self.drawn, self.clock = run, 0, time.monotonic(), time.monotonic()
+        at_steps = s.at_steps * (s.algo == "rgat")
+        total = s.pretrain_steps * (1 if s.algo == "real" else 2) + s.grounding_steps * (s.policy_steps + at_steps)
+        self.tqdm = tqdm(total=total, unit="step", unit_scale=True, disable=None, dynamic_ncols=True, smoothing=0.05)
+
+    def phase(self, step, name):
+        """An on_update callback for one phase of one grounding step."""
+        before = 0
+
+        def on_update(stats):
+            nonlocal before
+            new, before = stats["steps"] - before, stats["steps"]
+            self.seen += new * (name != "reference")
+            self.tqdm.update(new)
+            self.tqdm.set_description(f"step {step}, {name}, return {stats['return']:.0f}")
+            self.run.log_update(step, name, stats)
+            if time.monotonic() - self.drawn > 20:
+                self.run.flush()
+                self.drawn = time.monotonic()
+
+        return on_update
+
+    def skip(self, steps):
+        """Steps that an earlier run has done."""
+        self.seen += steps
+        self.tqdm.update(steps)
+
+    def lap(self):
+        """(environment steps, seconds) since the last lap."""
+        steps, seconds = self.seen, time.monotonic() - self.clock
+        self.seen, self.clock = 0, time.monotonic()
+        return steps, seconds
+
+    def say(self, line):
+        self.tqdm.write(line)
+
+
+def verdict(s, run):
+    """The best policy judged once more, on real episodes that did not choose it: best.json, and a line that says so."""
+    step = max(range(len(run.progress)), key=lambda k: float(run.progress[k]["real_return_deterministic"]))
+    policy = GaussianPolicy.load(run.folder / "policy.pt")
+    real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real))
+    returns = rollouts(policy, real, 2 * s.eval_episodes, seed_for(s.seed, step, "best"), deterministic=True)[0]
+    best = {"grounding_step": step, "episodes": len(returns), "real_return_deterministic": float(returns.mean()), "se": standard_error(returns)}
+    write_whole(run.folder / "best.json", json.dumps(best, indent=1))
+    lines = ", ".join(f"{name} {value:.0f}" for name, value in run.lines.items())
+    return f"{run.folder}: best on real after grounding step {step}: {best['real_return_deterministic']:.0f} ± {best['se']:.0f} on {len(returns)} fresh episodes ({lines})"
+
+
+def replay(folder):
+    """Draw a run's best policy acting in sim and on real into the run's replay.gif."""
+    run, saved = Run.open(folder)
+    s = Settings(**saved).completed()
+    policy = GaussianPolicy.load(run.folder / "policy.pt")
+    worlds = {"sim": BatchEnv(s.env, 1), "real": BatchEnv(s.env, 1, parse_perturbation(s.real))}
+    if policy.sizes[0] != worlds["sim"].single_observation_space.shape[0]:
+        raise RunError(f"{folder}/policy.pt was trained on another task than {s.env}: start a new run")
+    returns = animate(policy, worlds, run.folder / "replay.gif")
+    print(f"{run.folder / 'replay.gif'}: " + ", ".join(f"{name} {value:.0f}" for name, value in returns.items()))
+
+
+def parse(argv):
+    """The command line as (Settings, its explicit options, arguments of the run itself)."""
+    parser = argparse.ArgumentParser(prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for f in dataclasses.fields(Settings):
+        kind = {"int": int, "float": float, "str": str}[getattr(f.type, "__name__", f.type)]
+        shown = "" if f.default is None else f" (default: {f.default})"
+        extra = {k: v for k, v in f.metadata.items() if k != "help"}
+        parser.add_argument(f"--{f.name.replace('_', '-')}", type=kind, default=f.default, help=f.metadata["help"] + shown, **extra)
+    parser.add_argument("--out", help="folder of the run (default: runs/ENV-ALGO-SEED)")
+    parser.add_argument("--resume", metavar="RUN", help="continue the run in this folder, with the settings it began with")
+    parser.add_argument("--replay", metavar="RUN", help="animate the best policy of this run on sim and real, to RUN/replay.gif")
+    return parser.parse_args(argv)
+
+
+def main(argv=None):
+    """The command; returns its exit status. 0: done; 2: a request that cannot be met, told in one line; 130: Ctrl-C."""
+    args = parse(argv)
+    run = None
+    try:
+        if args.replay:
+            replay(args.replay)
+            return 0
+        if args.resume:
+            run, saved = Run.open(args.resume)
+            s = Settings(**saved).completed()
+        else:
+            s = Settings(**{f.name: getattr(args, f.name) for f in dataclasses.fields(Settings)}).completed()
+            run = Run.create(args.out or f"runs/{s.env}-{s.algo}-s{s.seed}", dataclasses.asdict(s))
+        algorithm_1(s, run, Bar(s, run))
+        print(verdict(s, run))
+        return 0
+    except (EnvError, RunError) as error:
+        print(f"train.py: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nstopped; go on with: python train.py --resume {run.folder if run else ''}", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
