@@ -167,6 +167,9 @@ def main(argv=None):
             bar.close()
         print(f"diagnose.py: {error}" if str(error) else "diagnose.py: out of memory; give fewer or shorter recordings", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("\ndiagnose.py: stopped; nothing was written", file=sys.stderr)
+        return 130
     if bar is not None:
         bar.close()
     print(wording.terminal(diagnosis.summary, args.out.rstrip("/")))

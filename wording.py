@@ -139,8 +139,8 @@ def terminal(summary, out):
     lines = [verdict_words(summary)]
     for finding in summary["findings"]:
         lines.append(f"  {finding_words(finding)}")
-        for other in finding.get("also_possible") or []:
-            lines.append(f"    or, as far as these recordings tell: {finding_words(other)}")
+        rivals = ", ".join(f"{effect_words(other['effect'])} of {place_words(other['place'])}" for other in finding.get("also_possible") or [])
+        lines += [f"    (these recordings cannot tell it from: {rivals})"] if rivals else []
     lines.append(sentence(error_words(summary)))
     left = unexplained_words(summary)
     lines += [sentence(left)] if left else []
