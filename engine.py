@@ -19,6 +19,7 @@ from signals import Signal
 from surroundings import touchable
 
 COPY_BYTES = 50e6  # of edited models kept for the next call
+ROTATES = 1  # body_simple of a simple body with rotations; one that only slides is 2, and feels contacts differently if not simple
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
@@ -39,7 +40,8 @@ class Engine:
     def __init__(self, spec, nominal, structure):
         spec, self.nominal = spec.copy(), nominal
         for body in spec.bodies[1:]:
-            body.simple = 0  # a simple body refuses a shifted centre of mass
+            if nominal.body(body.name).simple[0] == ROTATES:  # a simple body refuses a shifted centre of mass
+                body.simple = 0
         for actuator in spec.actuators:
             actuator.delay, actuator.nsample = 0, 0  # Signal delays the control instead
             if actuator.biastype == mujoco.mjtBias.mjBIAS_NONE:

@@ -60,6 +60,16 @@ class Mass(InertialEffect):
         model.body_mass[i] = values[0]
 
 
+def turning(model, i):
+    """Whether body i can rotate."""
+    while i:
+        joints = model.jnt_type[model.body_jntadr[i]:model.body_jntadr[i] + model.body_jntnum[i]]
+        if (joints != SLIDE).any():
+            return True
+        i = model.body_parentid[i]
+    return False
+
+
 def _size(model, i):
     """Length scale of a body: its radius of gyration, or its centre's distance from the joint."""
     return max(np.sqrt(model.body_inertia[i].max() / model.body_mass[i]), 0.3 * np.linalg.norm(model.body_ipos[i]))
@@ -69,6 +79,9 @@ def _size(model, i):
 class CenterOfMass(InertialEffect):
     """The centre of mass lies elsewhere in the body's frame."""
     name, related = 'center_of_mass', ('mass', 'inertia')
+
+    def fits(self, model, i):
+        return super().fits(model, i) and turning(model, i)
 
     def parameters(self, model, i):
         s = _size(model, i)
@@ -82,6 +95,9 @@ class CenterOfMass(InertialEffect):
 class Inertia(InertialEffect):
     """Other principal moments of inertia about the centre of mass."""
     name, related = 'inertia', ('mass', 'armature')
+
+    def fits(self, model, i):
+        return super().fits(model, i) and turning(model, i)
 
     def parameters(self, model, i):
         return tuple(Parameter(n, 'kg·m²', I, 0.02 * I, 100 * I, 0.02 * I) for n, I in zip(('ixx', 'iyy', 'izz'), model.body_inertia[i]))

@@ -204,6 +204,24 @@ def test_a_batch_is_its_members(case):
             np.testing.assert_array_equal(a[0], b[k, :window.last - window.first + 1])
 
 
+def test_a_block_that_only_slides_and_hops():
+    """Such a body is `simple` to MuJoCo, and its contacts would be softer if it were not."""
+    xml = """<mujoco><option timestep="0.002" cone="elliptic"/><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .05">
+             <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size=".08 .08 .05" mass="1"/>
+             </body></worldbody><actuator><motor joint="x"/><motor joint="z"/></actuator></mujoco>"""
+    world = World(mujoco.MjSpec.from_string(xml))
+    rng = np.random.default_rng(0)
+    recording = SimpleNamespace(name='', time=np.arange(60) * 0.01, ctrl=rng.uniform(-20, 10, (60, 2)))
+    data, run = mujoco.MjData(world.model), []
+    data.qvel[:] = 0.3, 0.8
+    for t in range(60):
+        run.append(data.qpos.copy())
+        data.ctrl[:] = recording.ctrl[t]
+        mujoco.mj_step(world.model, data, 5)
+    qpos, _ = world.simulate([{}], [[0.0, 0.0]], [[0.3, 0.8]], [Window(recording, 0, 59)])
+    np.testing.assert_allclose(qpos[0], run, rtol=0, atol=1e-12)
+
+
 CUBE = """
 <mujoco><option timestep="0.001"/><worldbody><geom name="floor" type="plane" size="3 3 .1"/><body name="cube" pos="0 0 .3">
 <freejoint name="free"/><geom name="box" type="box" size=".05 .05 .05" mass=".4"/></body></worldbody></mujoco>"""
