@@ -13,6 +13,7 @@ Held-out recordings enter only after everything is chosen and fitted.
 
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 
 import evidence
@@ -24,7 +25,7 @@ from recordings import RecordingError
 
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
 FINAL_STEPS = 30000
-LEAST_ROWS = 8  # of a window
+LEAST_ROWS, LEAST_WINDOWS = 8, 20
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
@@ -104,8 +105,14 @@ def windows_for(world, recordings, span, steps):
         sample = np.median(np.diff(r.time))
         every += cut.consecutive(r, max(span, LEAST_ROWS * sample))
     duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
-    number = max(20, int(steps * world.model.opt.timestep / duration))
+    number = max(LEAST_WINDOWS, int(steps / dear(world.model) * world.model.opt.timestep / duration))
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]
+
+
+def dear(model):
+    """What one step of a model costs, about, with a two-joint arm's as 1."""
+    runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    return (6 + model.nv) / 8 * (3.0 if runge_kutta else 1.0)
 
 
 def problem_of(world, recordings, position_noise, velocity_noise, span, steps):
@@ -208,7 +215,7 @@ def assemble(world, train, held_out, fit, search, possible, ranking, position_no
             "parameters": parameters_of(candidate, values, bounds[candidate]),
             "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
                          "p_value": search.significance(fit, candidate)[0]},
-            "depends_on": depends_on(candidate), "when": None, "written_as": written[candidate],
+            "depends_on": depends_on(model, candidate), "when": None, "written_as": written[candidate],
             "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible[candidate])})
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
@@ -246,9 +253,19 @@ def unit_of(model, channel):
     return "rad"
 
 
-def depends_on(candidate):
-    return list(getattr(candidate.effect, "depends_on", lambda place: [])(candidate.place)) if hasattr(
-        candidate.effect, "depends_on") else []
+# What the force of an effect varies with.
+VARIABLES = {"velocity": ("viscous_damping", "quadratic_damping", "coulomb_friction", "stribeck_friction", "back_emf"),
+             "position": ("stiffness", "nonlinear_stiffness", "joint_stop", "backlash", "cogging"),
+             "control": ("gain", "saturation", "dead_zone", "delay", "lag"),
+             "contact": ("contact_friction", "contact_stiffness", "contact_damping", "ground_height")}
+
+
+def depends_on(model, candidate):
+    variable = next((v for v, names in VARIABLES.items() if candidate.effect.name in names), None)
+    name = candidate.place.name
+    if variable == "velocity" and candidate.place.kind == "actuator":
+        name = cut.joint_name(model, model.actuator(name).trnid[0])
+    return [f"{variable}:{name}"] if variable else []
 
 
 def also_possible(world, train, noise, hypothesis, candidate, others, most=3):

@@ -14,10 +14,9 @@ import numpy as np
 
 import scores
 import shooting
-from probes import values_to_try
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
-WORTH = 0.03  # least fall of the squared residual, of what is there, that an effect must bring
+WORTH, WORTH_MISFIT = 0.03, 0.1  # least fall of the squared residual that an effect must bring; where it is far above the noise
 FEW = 16  # windows, at least, of a refit that only has to tell hypotheses apart
 
 
@@ -56,17 +55,16 @@ class Step:
 
 
 def options_of(world, recordings):
+    """Every way to try every candidate. Effects with probes of their own have no gradient at their nominal value."""
     out = []
     for candidate in world.candidates:
         if candidate.effect.timed:
             continue
-        nominal = np.array([p.nominal for p in candidate.parameters])
-        probes = values_to_try(world.model, candidate, recordings)
-        for probe in probes:
-            out.append(Option(candidate, (tuple(probe),), False))
-        if len(probes) == 0:
-            moves = shooting.perturbed(shooting.Hypothesis(((candidate, tuple(nominal)),)))[0]
-            out.append(Option(candidate, tuple(tuple(m[candidate]) for m in moves), True))
+        if candidate.effect.overrides("probes"):
+            out += [Option(candidate, (tuple(float(v) for v in row),), False) for row in world.probes(candidate, recordings)]
+        else:
+            moved = shooting.perturbed(shooting.Hypothesis(((candidate, candidate.nominal),)))[0]
+            out.append(Option(candidate, tuple(m[candidate] for m in moved), True))
     return out
 
 
@@ -78,6 +76,8 @@ class Search:
         few = max(FEW, len(problem.windows) // 4)
         self.few = np.unique(np.linspace(0, len(problem.windows) - 1, min(few, len(problem.windows))).round().astype(int))
         self.small = problem.subset(self.few)
+        self.scouts = self.few[::2]
+        self.scouting = problem.subset(self.scouts)
         self.places = len({o.candidate for o in self.options})
         labels = scores.clusters(problem.windows)
         count = labels.max() + 1
@@ -85,10 +85,15 @@ class Search:
         if self.pieces > 1:
             labels = np.arange(len(problem.windows) * self.pieces)
         self.labels = labels
-        by_window = labels.reshape(len(problem.windows), self.pieces)[self.few].ravel()
-        self.few_labels = np.unique(by_window, return_inverse=True)[1]
+        by_window = labels.reshape(len(problem.windows), self.pieces)
+        self.few_labels = np.unique(by_window[self.few].ravel(), return_inverse=True)[1]
+        self.scout_labels = np.unique(by_window[self.scouts].ravel(), return_inverse=True)[1]
         self.progress = progress or (lambda message: None)
-        self.ranking = []
+        self.ranking, self.kept = [], set()
+
+    def worth(self, fit):
+        """Least fall of the squared residual: more where no hypothesis comes near the noise, and small gains mean little."""
+        return WORTH if fit.chi2.sum() < 4 * self.problem.rows else WORTH_MISFIT
 
     # ---- linear scan ---------------------------------------------------------------------------
 
@@ -97,7 +102,7 @@ class Search:
         base, moves = shooting.perturbed(fit.hypothesis)
         slope = shooting.columns(problem, [fit], [base + settings])[0]
         scan = shooting.project(problem, fit, slope, self.pieces)
-        labels = self.labels if problem is self.problem else self.few_labels
+        labels = {id(self.problem): self.labels, id(self.small): self.few_labels, id(self.scouting): self.scout_labels}[id(problem)]
         gram, score = scores.summed(labels, scan.gram), scores.summed(labels, scan.score)
         k = len(base)
         if k:
@@ -114,15 +119,31 @@ class Search:
                     + share.T @ gram[:, :k, :k] @ share)
         return gram, score, float(scan.chi2.sum())
 
-    def trials(self, fit, problem=None):
-        """All options not yet in the hypothesis, best gain first; and the cluster sums of their columns."""
+    def trials(self, fit):
+        """All options not yet in the hypothesis, best gain first; the cluster sums of their columns; chi2 before."""
         options = [o for o in self.options if o.candidate not in fit.hypothesis.candidates]
+        plain = [o for o in options if o.linear]
+        return self.scan(fit, plain + self.screened(fit, [o for o in options if not o.linear]), self.problem)
+
+    def screened(self, fit, options, most=12):
+        """The most promising of the many probes of effects without gradient, looked at in few windows."""
+        found, _, _, chi2 = self.scan(fit.subset(self.scouts), options, self.scouting)
+        out, count = [], {}
+        for t in found:
+            candidate = t.option.candidate
+            if t.gain > WORTH / 3 * chi2 and count.setdefault(candidate, 0) < 2 and len(out) < most:
+                count[candidate] += 1
+                out.append(t.option)
+        self.kept.update(out)
+        return out
+
+    def scan(self, fit, options, problem):
         settings, where = [], []
         for option in options:
             where.append(range(len(settings), len(settings) + len(option.directions)))
             settings += [fit.hypothesis.plus(option.candidate, d).settings for d in option.directions]
-        gram, score, chi2 = self.reduced(fit, settings, problem or self.problem)
-        own = np.array([np.diag(g) for g in gram]).sum(0)
+        gram, score, chi2 = self.reduced(fit, settings, problem)
+        own = np.einsum("ckk->k", gram)
         out = []
         for option, mine in zip(options, where):
             columns = [c for c in mine if own[c] > shooting.UNSEEN]
@@ -190,12 +211,12 @@ class Search:
             trials, gram, score, chi2 = self.trials(fit)
             if not self.ranking:
                 self.ranking = trials
-            level = ALPHA / self.places
-            hopeful = [t for t in trials if t.start and t.p_value < 10 * level and t.held > 0 and t.gain > 0.3 * WORTH * chi2]
+            level, worth = ALPHA / self.places, self.worth(fit)
+            hopeful = [t for t in trials if t.start and t.p_value < 10 * level and t.held > 0 and t.gain > 0.3 * worth * chi2]
             proposals = [[(t.option.candidate, t.start)] for t in self.spread(hopeful, gram, singles)]
             best = max((t.gain for t in trials if t.start), default=0.0)
             proposals += [list(pair) for gain, *pair in self.pairs(trials, gram, score, doubles)
-                          if gain > best + max(2 * WORTH * chi2, 0.1 * best)]
+                          if gain > best + max(2 * worth * chi2, 0.1 * best)]
             if not proposals:
                 break
             hypotheses = [fit.hypothesis for _ in proposals]
@@ -263,7 +284,7 @@ class Search:
 
     def choose(self, fit, fits, proposals):
         """The hypothesis that wins, refitted to all windows, as (Fit, added candidates, p-value); None when none earns its keep."""
-        level, before = ALPHA / self.places, fit.chi2[self.few].sum()
+        level, before, worth = ALPHA / self.places, fit.chi2[self.few].sum(), self.worth(fit)
         order = sorted(range(len(fits)), key=lambda i: fits[i].chi2.sum())
         # a pair wins only over what the best single leaves for a second step
         single = next((i for i in order if len(proposals[i]) == 1), None)
@@ -273,10 +294,10 @@ class Search:
                 order.insert(0, single)
         for i in order[:3]:
             added = tuple(candidate for candidate, _ in proposals[i])
-            if 1 - fits[i].chi2.sum() / before < 0.5 * WORTH * len(added):
+            if 1 - fits[i].chi2.sum() / before < 0.5 * worth * len(added):
                 continue
             [new] = shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4)
-            if 1 - new.chi2.sum() / fit.chi2.sum() < WORTH * len(added):
+            if 1 - new.chi2.sum() / fit.chi2.sum() < worth * len(added):
                 continue
             p = max(self.significance(new, c)[0] for c in added)
             if p < level:
@@ -287,12 +308,13 @@ class Search:
         """Leave out earlier effects that no longer earn their keep."""
         while True:
             earlier = {c: self.significance(fit, c) for c in fit.hypothesis.candidates if c not in added}
-            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * WORTH or p > ALPHA / self.places]
+            worth = self.worth(fit)
+            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * worth or p > ALPHA / self.places]
             if not weak:
                 return fit
             weakest = min(weak, key=lambda c: earlier[c][1])
             [less] = shooting.solve(self.problem, [fit.hypothesis.minus(weakest)], fit, iterations=4)
-            if less.chi2.sum() > (1 + WORTH) * fit.chi2.sum() and earlier[weakest][0] <= ALPHA / self.places:
+            if less.chi2.sum() > (1 + worth) * fit.chi2.sum() and earlier[weakest][0] <= ALPHA / self.places:
                 return fit
             fit = less
 
@@ -350,7 +372,7 @@ class Search:
         values = small.hypothesis.settings[candidate]
         without = small.hypothesis.minus(candidate)
         own = [{**s, candidate: values} for s in shooting.perturbed(without)[0]]
-        options = [o for o in self.options if o.candidate not in small.hypothesis.candidates]
+        options = [o for o in self.options if o.candidate not in small.hypothesis.candidates and (o.linear or o in self.kept)]
         tried = [small.hypothesis.plus(o.candidate, d).settings for o in options for d in o.directions]
         slope = shooting.columns(self.small, [small], [own + [without.settings] + tried])[0]
         scan = shooting.project(self.small, small, slope)
@@ -398,11 +420,6 @@ class Search:
         return [(f, option.candidate) for f, (option, _) in zip(fits, close)], pair
 
 
-# Of effects that the data cannot tell apart the first named here is preferred: what is most common, then simplest.
-COMMON = ("time_step", "viscous_damping", "coulomb_friction", "mass", "gain", "armature", "spring_offset", "stiffness", "bias", "delay",
-          "contact_friction", "quadratic_damping", "lag", "dead_zone", "saturation", "back_emf", "air_drag", "external_force", "gravity")
-
-
 def simplicity(candidate):
-    name = candidate.effect.name
-    return len(candidate.parameters), COMMON.index(name) if name in COMMON else len(COMMON)
+    """What to prefer among effects that the data cannot tell apart."""
+    return len(candidate.parameters), candidate.effect.simplicity

@@ -113,6 +113,8 @@ class Problem:
         """(S, m): S simulations, the i-th in window which[i] under settings[i] from (qpos[i], qvel[i])."""
         which = np.asarray(which)
         predicted_qpos, predicted_qvel = self.world.simulate(settings, qpos, qvel, [self.windows[i] for i in which])
+        short = ((0, 0), (0, self.weight.shape[1] - predicted_qpos.shape[1]), (0, 0))  # these may be the shorter windows
+        predicted_qpos, predicted_qvel = np.pad(predicted_qpos, short), np.pad(predicted_qvel, short)
         with np.errstate(invalid="ignore", over="ignore"):
             gap = np.concatenate([cut.difference(self.model, predicted_qpos, self.measured_qpos[which]),
                                   self.measured_qvel[which] - predicted_qvel], -1)
@@ -325,7 +327,7 @@ def _propose(fit, slope, moves, damping):
         outside = free & ((target < low) | (target > high))
         if not outside.any():
             break
-        move[outside] = ((np.clip(target, low, high) - vector) / moves)[outside]
+        move[outside] = (np.clip(target, low, high)[outside] - vector[outside]) / moves[outside]
         free &= ~outside
     step = np.einsum("wij,wj->wi", inverse, pull - cross @ move)
     return np.clip(vector + moves * move, low, high), step
