@@ -17,6 +17,7 @@ import argparse
 from concurrent.futures import ProcessPoolExecutor, as_completed
 import csv
 import json
+from multiprocessing import Queue
 import os
 from pathlib import Path
 import subprocess
@@ -277,6 +278,13 @@ def write(path, rows):
     os.replace(temporary, path)
 
 
+def _pin(cores):
+    """Keep this worker and the diagnoses that it starts on one core, where there is more than one worker."""
+    core = cores.get()
+    if core is not None:
+        os.sched_setaffinity(0, {core})
+
+
 def run(seed, numbers, out, jobs):
     """Run the trials `numbers` of a seed that `out` does not hold yet."""
     out = Path(out)
@@ -284,7 +292,11 @@ def run(seed, numbers, out, jobs):
     rows = read(out)
     done = {int(row["trial"]) for row in rows if int(row["seed"]) == seed}
     wanted = [number for number in numbers if number not in done]
-    with ProcessPoolExecutor(jobs) as pool:
+    cores = Queue()                                  # one for each worker, lest threads wait for each other
+    allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    for job in range(jobs):
+        cores.put(allowed[job % len(allowed)] if allowed and jobs > 1 else None)
+    with ProcessPoolExecutor(jobs, initializer=_pin, initargs=(cores,)) as pool:
         futures = [pool.submit(run_trial, seed, number, f"{out}.sealed") for number in wanted]
         for future in tqdm(as_completed(futures), total=len(futures), disable=not sys.stderr.isatty()):
             rows.append(future.result())
