@@ -219,7 +219,9 @@ def _traces(diagnosis):
     def draw(i):
         trace = diagnosis.traces[i]
         time = np.asarray(trace["time"], float)
-        lines = [Series(time, np.asarray(trace[look], float), look) for look in ("measured", "nominal", "corrected")]
+        values = {look: np.asarray(trace[look], float) for look in ("measured", "nominal", "corrected")}
+        joint = np.isnan(list(values.values())).all(axis=0)  # between two predictions; the recording runs on
+        lines = [Series(time[~joint], values["measured"][~joint], "measured"), *(Series(time, values[look], look) for look in ("nominal", "corrected"))]
         return (f'<h3 class="trace">{E(trace["channel"])} <small>{E(trace["recording"])}</small></h3>'
                 + _box(chart(lines, "time (s)", trace["channel"].split(":", 1)[-1], 900, 240, label=f"{trace['channel']} over time"), wide=True))
 
