@@ -20,12 +20,14 @@ import evidence
 import scores
 import selection
 import shooting
+import unknown
 import windows as cut
 from recordings import RecordingError
 
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
 FINAL_STEPS = 30000
 LEAST_ROWS, LEAST_WINDOWS = 8, 20
+LEFTOVER_SPANS, LEFTOVER_WORTH = (0.2, 0.1), 0.02  # s; share of the nominal's squared residual that a leftover must explain
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
@@ -77,13 +79,15 @@ def identify(world, train, held_out, progress=None):
     say(0.6, "alternatives")
     fit, possible = search.settle(fit)
     hypothesis = fit.hypothesis
+    say(0.75, "testing for anything left")
+    hypothesis, left = anything_left(data, search, hypothesis)
     say(0.8, "intervals")
     final = problem_of(*data, span, FINAL_STEPS)
     fit = shooting.fit_starts(final, hypothesis)
     if hypothesis.effects:
         [fit] = shooting.solve(final, [hypothesis], fit)
     say(0.9, "held-out error")
-    return assemble(world, train, held_out, fit, selection.Search(world, final, train), possible, ranking,
+    return assemble(world, train, held_out, fit, selection.Search(world, final, train), possible, left, ranking,
                     position_noise, velocity_noise)
 
 
@@ -91,10 +95,26 @@ def identify(world, train, held_out, progress=None):
 
 
 def noise_of(world, train):
-    """Position and velocity noise per dof, (nv,), (nv,): differences, lowered where short windows fit better."""
-    position, velocity = cut.measurement_noise(world.model, train)
+    """Position and velocity noise per dof, (nv,), (nv,): by differences, or what the nominal model leaves of short windows.
+
+    Both are upper bounds: differences where the control jumps at every row, the model where it is wrong.
+    """
+    model = world.model
+    position, velocity = cut.measurement_noise(model, train)
     if not np.isfinite(position).any() and not np.isfinite(velocity).any():
         raise RecordingError("not enough data: recordings need at least ten measured rows in some qpos column")
+    sample = np.median([np.median(np.diff(r.time)) for r in train])
+    for _ in range(2):
+        problem = problem_of(world, train, position, velocity, LEAST_ROWS * sample, SEARCH_STEPS)
+        fit = shooting.fit_starts(problem, shooting.Hypothesis())
+        weight = problem.weight
+        square = np.where(weight > 0, fit.residual[:, :weight[0].size].reshape(weight.shape) / np.where(weight > 0, weight, 1), 0) ** 2
+        rows = (weight > 0).sum(1)  # (W, 2 nv)
+        left = np.array([np.sqrt(np.median(s[r > 3] / (r[r > 3] - 2))) if (r > 3).any() else np.inf
+                         for s, r in zip(square.sum(1).T, rows.T)])
+        for dofs in cut.channels(model).values():
+            left[dofs] = np.sqrt(np.mean(left[dofs] ** 2))
+        position, velocity = np.minimum(position, left[:model.nv]), np.minimum(velocity, left[model.nv:])
     return position, velocity
 
 
@@ -160,6 +180,32 @@ def span_for(world, train, position_noise, velocity_noise, hypothesis, at_least=
     return span
 
 
+def anything_left(data, search, hypothesis):
+    """(hypothesis, Leftover or None): the residual's dependence on position, velocity, control and time.
+
+    Named effects that only stood in for the leftover curve go.
+    """
+    for span in LEFTOVER_SPANS:
+        problem = problem_of(*data, span, FINAL_STEPS)
+        bare = shooting.fit_starts(problem, shooting.Hypothesis()).chi2.sum()
+
+        def look(h):
+            fit = shooting.fit_starts(problem, h)
+            found = unknown.leftover(search, problem, fit, LEFTOVER_WORTH * bare)
+            return found, fit.chi2.sum() * (1 - found.share if found else 1.0)
+
+        found, rest = look(hypothesis)
+        if found is None:
+            continue
+        for candidate in hypothesis.candidates:
+            again, alone = look(hypothesis.minus(candidate))
+            if again and again.joint == found.joint and alone - rest < 0.1 * (bare - rest):
+                hypothesis, found, rest = hypothesis.minus(candidate), again, alone
+        curve = found.candidate(data[0])
+        return (hypothesis.plus(curve, found.force) if curve else hypothesis), found
+    return hypothesis, None
+
+
 # ---- report ------------------------------------------------------------------------------------
 
 
@@ -200,7 +246,7 @@ def noise_by_channel(model, position_noise):
             if np.isfinite(position_noise[dofs]).all()}
 
 
-def assemble(world, train, held_out, fit, search, possible, ranking, position_noise, velocity_noise):
+def assemble(world, train, held_out, fit, search, possible, left, ranking, position_noise, velocity_noise):
     settings, model = fit.hypothesis.settings, world.model
     noise = evidence.reporting_noise(position_noise)
     bounds = intervals(search, fit)
@@ -210,13 +256,18 @@ def assemble(world, train, held_out, fit, search, possible, ranking, position_no
     xml, written = world.corrected_xml(settings)
     for candidate, values in fit.hypothesis.effects:
         without = evidence.prediction_error(world, fit.hypothesis.minus(candidate).settings, held, noise)[0]
+        curve = candidate.effect.name == "unknown"
         findings.append({
             "effect": candidate.effect.name, "place": place_of(candidate),
             "parameters": parameters_of(candidate, values, bounds[candidate]),
             "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
                          "p_value": search.significance(fit, candidate)[0]},
-            "depends_on": depends_on(model, candidate), "when": None, "written_as": written[candidate],
-            "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible[candidate])})
+            "depends_on": list(left.variables) if curve else depends_on(model, candidate), "when": None, "written_as": written[candidate],
+            "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible.get(candidate, []))})
+    if left and not left.simulable:  # found, but no curve of one variable: nothing to simulate
+        findings.append({"effect": "unknown", "place": {"kind": "joint", "name": left.joint}, "parameters": [],
+                         "evidence": {"held_out_error_removed": 0.0, "p_value": left.p_value, "residual_explained": left.share},
+                         "depends_on": list(left.variables), "when": None, "written_as": "none", "also_possible": []})
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
                "held_out": figure(world, settings, held, position_noise, velocity_noise)}

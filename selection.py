@@ -70,7 +70,7 @@ def options_of(world, recordings):
 
 class Search:
     def __init__(self, world, problem, recordings, progress=None):
-        self.world, self.problem = world, problem
+        self.world, self.model, self.problem = world, world.model, problem
         self.options = options_of(world, recordings)
         # refits that only have to tell hypotheses apart use some of the windows
         few = max(FEW, len(problem.windows) // 4)
@@ -104,7 +104,12 @@ class Search:
         scan = shooting.project(problem, fit, slope, self.pieces)
         labels = {id(self.problem): self.labels, id(self.small): self.few_labels, id(self.scouting): self.scout_labels}[id(problem)]
         gram, score = scores.summed(labels, scan.gram), scores.summed(labels, scan.score)
-        k = len(base)
+        gram, score = self.freed(gram, score, len(base))
+        return gram, score, float(scan.chi2.sum())
+
+    @staticmethod
+    def freed(gram, score, k):
+        """Cluster sums of the columns from k on, with the first k (a fit's own parameters) projected out."""
         if k:
             total, pull = gram.sum(0), score.sum(0)
             size = np.sqrt(np.maximum(np.diag(total)[:k], 1e-300))
@@ -117,7 +122,7 @@ class Search:
             score = score[:, k:] - score[:, :k] @ share
             gram = (gram[:, k:, k:] - mixed @ share - np.swapaxes(mixed @ share, 1, 2)
                     + share.T @ gram[:, :k, :k] @ share)
-        return gram, score, float(scan.chi2.sum())
+        return gram, score
 
     def trials(self, fit):
         """All options not yet in the hypothesis, best gain first; the cluster sums of their columns; chi2 before."""
