@@ -61,7 +61,8 @@ def body_force(item, model, data, acceleration, event):
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
         mujoco.mj_jacDot(model, data, rate, None, data.xipos[body], body)
-        data.xfrc_applied[body, :3] += p["mass"] * (model.opt.gravity - jacobian @ acceleration - rate @ data.qvel)
+        added = p["mass"] - model.body_mass[body]
+        data.xfrc_applied[body, :3] += added * (model.opt.gravity - jacobian @ acceleration - rate @ data.qvel)
     elif effect in ("air_drag", "wind"):
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)

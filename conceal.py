@@ -273,7 +273,7 @@ def _body(effect, name, size, sign, model, scale, rng):
     if effect == "link_length":
         return _place(effect, "body", name, length=float(np.linalg.norm(body.pos)) * (1 + sign * 0.5 * size))
     if effect == "payload_change":
-        return _place(effect, "body", name, mass=2 * size * mass, event=True)
+        return _place(effect, "body", name, mass=(1 + 2 * size) * mass, event=True)
     angle, weight = rng.uniform(0, 2 * np.pi), 9.81 * mass * 2 * size
     return _place(effect, "body", name, x=float(weight * np.cos(angle)), y=0.0, z=float(weight * np.sin(angle)),
                   event=bool(rng.random() < 0.5))

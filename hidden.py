@@ -274,7 +274,7 @@ class Real:
         if effect == "lag":
             old, decay = self.memory["lags"].get(index, u), np.exp(-dt / p["seconds"])
             self.memory["lags"][index] = u + (old - u) * decay
-            if self.finer == 1:                      # as a simulator of this step would have it
+            if self.finer == 1 and self.stage == 1:  # as a simulator of this step would have it
                 return self.memory["lags"][index]
             return u + (old - u) * (1 - decay) * p["seconds"] / dt           # mean over the step
         if self.model.actuator_biasprm[index].any():

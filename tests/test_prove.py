@@ -196,10 +196,11 @@ def test_backlash_lets_the_motor_turn_by_its_gap():
 @pytest.mark.parametrize("name,load", [("pendulum", "arm"), ("arm2", "fore"), ("furuta", "pendulum")])
 def test_payload_is_a_point_mass_at_the_centre_of_mass(name, load):
     mechanism = MECHANISMS[name]
-    real = Real(mechanism, [hide("payload_change", "body", load, mass=0.05, event=True)], finer=8)
     model = mechanism.spec().compile()
+    heavy = float(model.body(load).mass[0]) + 0.05
+    real = Real(mechanism, [hide("payload_change", "body", load, mass=heavy, event=True)], finer=8)
     model.opt.timestep /= 8
-    model.body_mass[model.body(load).id] += 0.05
+    model.body_mass[model.body(load).id] = heavy
     mujoco.mj_setConst(model, mujoco.MjData(model))
     data = mujoco.MjData(model)
     data.qpos[:] = 0.8
