@@ -1,202 +1,138 @@
 """Runs S windows at once on one working model: what World.simulate is made of.
 
-The working model is the nominal one, rebuilt so that every effect can be put into
-a copy of it. Effects change such copies, or the control signal before the run, so
-that a whole window is one call of mujoco.batch.Batch; only forces that depend on
-the state and effects under a condition are worked out step by step.
+Effects change copies of the model, or the control signal before the run, so that
+a whole window is one call of mujoco.batch.Batch; only forces that depend on the
+state and effects under a condition are worked out step by step.
 """
-
-from collections import OrderedDict
-from copy import copy
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from readout import read
-from signals import Signal
-from surroundings import touchable
+from readout import locate, read
+from working import BALL, FREE, Working
 
-COPY_BYTES = 50e6  # of edited models kept for the next call
-ROTATES = 1  # body_simple of a simple body with rotations; one that only slides is 2, and feels contacts differently if not simple
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
-FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
-
-
-class Drive(NamedTuple):
-    """What a simulation runs on: model, ctrl (count, nu), qfrc (nv,), xfrc (nbody, 6), and the effects in it."""
-    model: mujoco.MjModel
-    ctrl: np.ndarray
-    qfrc: np.ndarray
-    xfrc: np.ndarray
-    items: list
+RUN_UP = 0.4, 0.1  # seconds before a window to find hidden coordinates from, and between returns to the record
+SHOTS = 5          # corrections of a start that delayed sensors show late
 
 
 class Engine:
-    """The working model for a set of candidates that need parts of their own, its edited copies and its Batch."""
+    """Simulator for settings with the same structure, a frozenset of the candidates that need parts of their own."""
 
     def __init__(self, spec, nominal, structure):
-        spec, self.nominal = spec.copy(), nominal
-        for body in spec.bodies[1:]:
-            if nominal.body(body.name).simple[0] == ROTATES:  # a simple body refuses a shifted centre of mass
-                body.simple = 0
-        for actuator in spec.actuators:
-            actuator.delay, actuator.nsample = 0, 0  # Signal delays the control instead
-            if actuator.biastype == mujoco.mjtBias.mjBIAS_NONE:
-                actuator.type, actuator.biastype = mujoco.mjtActuator.mjACTUATOR_GENERAL, mujoco.mjtBias.mjBIAS_AFFINE
-        for material in spec.materials:  # never seen, slow to copy
-            material.textures = [''] * len(material.textures)
-        for texture in spec.textures:
-            spec.delete(texture)
-        for candidate in structure:
-            candidate.effect.build(spec, nominal, candidate.effect.id(nominal, candidate.place.name))
-        self.model = m = spec.compile()
-        idle = mujoco.mjtDisableBit.mjDSBL_ISLAND if m.ntree < 2 else 0
-        if not (m.npair or m.nflex or any(touchable(m, i).any() for i in range(m.ngeom))):
-            idle |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        m.opt.disableflags |= int(idle)  # what there is nothing to do for still takes its time
-        # where the nominal model's coordinates are in the working model, which may have more joints
-        self.q, self.v = [], []
-        for j in range(nominal.njnt):
-            k, kind = self.model.joint(nominal.joint(j).name).id, nominal.jnt_type[j]
-            self.q += range(self.model.jnt_qposadr[k], self.model.jnt_qposadr[k] + {FREE: 7, BALL: 4}.get(kind, 1))
-            self.v += range(self.model.jnt_dofadr[k], self.model.jnt_dofadr[k] + {FREE: 6, BALL: 3}.get(kind, 1))
-        self.data = mujoco.MjData(self.model)
+        self.working, self.nominal = Working(spec, nominal, structure), nominal
+        self.model, self.q, self.v = self.working.model, self.working.q, self.working.v
         self.rest = np.empty(mujoco.mj_stateSize(self.model, STATE))
-        mujoco.mj_getState(self.model, self.data, self.rest, STATE)
-        self.copies, self.batch = OrderedDict(), None
-        self.most_copies = max(64, int(COPY_BYTES / mujoco.mj_sizeModel(self.model)))
+        mujoco.mj_getState(self.model, self.working.data, self.rest, STATE)
+        self.batch = None
 
-    def run(self, cases, start_qpos, start_qvel, windows, rows, step, count, stepwise, sensors):
-        """World.simulate for simulations that share structure, time step and way of stepping."""
-        n = len(cases)
-        memo = {}
-        on = [self._drive(c.on, w, step, count, memo) for c, w in zip(cases, windows)]
-        off = [self._drive(c.off, w, step, count, memo) if c.when else d for c, w, d in zip(cases, windows, on)]
-        failed = np.array([a.model is None or b.model is None for a, b in zip(on, off)])
+    def run(self, cases, start_qpos, start_qvel, windows, rows, step, count, sensors):
+        """World.simulate for n simulations that share structure, time step and way of stepping.
 
-        joint, sensor = self._measures(cases)
-        offset, ratio, delay = joint
-        simple_q, simple_v = self._simple()
-        true_q, true_v = start_qpos.copy(), start_qvel.copy()
-        true_v[:, simple_v] /= ratio
-        true_q[:, simple_q] = (true_q[:, simple_q] - offset) / ratio + delay * true_v[:, simple_v]
+        Returns qpos (n, rows, nq), qvel (n, rows, nv) and, if `sensors`, sensordata (n, rows, nsensordata).
+        """
+        measures, sensor_measures = self._measures(cases)
+        (offset, ratio, delay), recordings = measures, [w.recording for w in windows]
+        # a window begins as long before its first row as its latest sensor is late; before the recording, it showed its first row
+        early = np.maximum(delay.max(axis=1, initial=0.0), sensor_measures[2].max(axis=1, initial=0.0))
+        early = np.minimum(early, [w.recording.time[w.first] - w.recording.time[0] for w in windows])
+        begin = np.array([w.recording.time[w.first] for w in windows]) - early
+        q, v = self._true(start_qpos, start_qvel, measures)
+        qpos, qvel = np.tile(self.model.qpos0, (len(cases), 1)), np.zeros((len(cases), self.model.nv))
+        if self.model.nq > self.nominal.nq:
+            qpos, qvel = self._run_up(cases, windows, begin, measures, step)
+        qpos[:, self.q], qvel[:, self.v] = q, v
+        if early.any():
+            lead = int(np.ceil(early.max() / step)) + 1
+            for _ in range(SHOTS):
+                trial = self._trajectory(cases, recordings, begin, qpos, qvel, step, lead)
+                shown = read(self.nominal, trial[0][..., self.q], trial[1][..., self.v], early[:, None], step, delay)
+                qpos[:, self.q] += q - shown[0][:, 0]
+                qvel[:, self.v] += v - shown[1][:, 0]
+            count += lead
 
-        if self.batch is None or self.batch.nsim < n:
-            self.batch = Batch(self.model, 1 << (n - 1).bit_length())
-        batch = self.batch
-        batch.warning[:] = 0
-        batch.state[:n] = self.rest
-        batch.bind('qpos')[:n, self.q], batch.bind('qvel')[:n, self.v] = true_q, true_v
-        if self.model.na:
-            batch.bind('act')[:n] = [self._activation(w) for w in windows]
-        record = ('qpos', 'qvel', 'sensordata') if sensors else ('qpos', 'qvel')
-        # sensordata belongs to the state before a step, so sensors need one step more
-        out = {f: np.full((n, count + sensors, getattr(self.data, f).size), np.nan) for f in record}
-        if stepwise:
-            failed |= self._step(batch, cases, windows, on, off, step, out)
-        else:
-            failed |= self._rollout(batch, on, out)
-        failed |= batch.warning[:n, :, 1].any(axis=1)
-
-        q = np.concatenate([true_q[:, None], out['qpos'][:, :count, self.q]], axis=1)
-        v = np.concatenate([true_v[:, None], out['qvel'][:, :count, self.v]], axis=1)
-        q[failed, 1:] = v[failed, 1:] = np.nan
-        time = np.full((n, rows), np.nan)
+        q, v, data = self._trajectory(cases, recordings, begin, qpos, qvel, step, count, sensors)
+        time = np.full((len(cases), rows), np.nan)
         for s, w in enumerate(windows):
-            time[s, :w.last - w.first + 1] = w.recording.time[w.first:w.last + 1] - w.recording.time[w.first]
-        qpos, qvel = read(self.nominal, q, v, time, step, simple_q, simple_v, delay)
+            time[s, :w.last - w.first + 1] = w.recording.time[w.first:w.last + 1] - begin[s]
+        qpos, qvel = read(self.nominal, q[..., self.q], v[..., self.v], time, step, delay)
+        simple_q, simple_v = simple(self.nominal)
         qpos[..., simple_q] = qpos[..., simple_q] * ratio[:, None] + offset[:, None]
         qvel[..., simple_v] *= ratio[:, None]
         qpos[:, 0], qvel[:, 0] = start_qpos, start_qvel
         if not sensors:
             return qpos, qvel
-        offset, ratio, delay = sensor
-        out['sensordata'][failed] = np.nan
-        late = np.maximum(time[..., None] - delay[:, None], 0.0) / step
-        k = np.clip(np.nan_to_num(late).astype(int), 0, count - 1)
-        f, s, c = late - k, np.arange(n)[:, None, None], np.arange(delay.shape[1])
-        data = (1 - f) * out['sensordata'][s, k, c] + f * out['sensordata'][s, k + 1, c]
-        return qpos, qvel, data * ratio[:, None] + offset[:, None]
+        offset, ratio, delay = sensor_measures
+        s, k, f = locate(np.maximum(time[..., None] - delay[:, None], 0.0) / step, count + 1)
+        column = np.arange(delay.shape[1])
+        values = (1 - f) * data[s, k, column] + f * data[s, np.minimum(k + 1, count), column]
+        return qpos, qvel, np.where(np.isnan(time)[..., None], np.nan, values * ratio[:, None] + offset[:, None])
 
-    def _edited(self, items, step):
-        """A copy of the model with the effects of items, or None if MuJoCo refuses it."""
-        key = (step, *((c, v) for c, v in items))
-        if key in self.copies:
-            self.copies.move_to_end(key)
-            return self.copies[key]
-        model = copy(self.model)
-        for candidate, values in items:
-            candidate.effect.edit(model, candidate.effect.id(model, candidate.place.name), values)
-        model.opt.timestep = step
-        if any(c.effect.constants for c, _ in items):
-            try:
-                mujoco.mj_setConst(model, self.data)
-            except mujoco.FatalError:
-                model = None
-        self.copies[key] = model
-        if len(self.copies) > self.most_copies:
-            self.copies.popitem(last=False)
-        return model
+    def _true(self, qpos, qvel, measures):
+        """Positions and velocities behind what sensors show, but for their delays."""
+        (simple_q, simple_v), (offset, ratio, _) = simple(self.nominal), measures
+        qpos, qvel = qpos.copy(), qvel.copy()
+        qpos[:, simple_q], qvel[:, simple_v] = (qpos[:, simple_q] - offset) / ratio, qvel[:, simple_v] / ratio
+        return qpos, qvel
 
-    def _drive(self, items, window, step, count, memo):
-        """The Drive of a window under items. memo keeps what simulations of one call share."""
-        key = id(items)
-        if key not in memo:
-            changed, qfrc, xfrc = {}, np.zeros(self.model.nv), np.zeros((self.model.nbody, 6))
-            for candidate, values in items:
-                if candidate.effect.overrides('command'):
-                    changed.setdefault(candidate.place.name, []).append((candidate.effect, values))
-                candidate.effect.push(qfrc, xfrc, self.model, candidate.effect.id(self.model, candidate.place.name), values)
-            memo[key] = self._edited(items, step), qfrc, xfrc, {name: tuple(effects) for name, effects in changed.items()}
-        model, qfrc, xfrc, changed = memo[key]
-        recording, m = window.recording, self.nominal
-        key = id(recording), window.first
-        if key not in memo:
-            memo[key] = np.zeros((count, m.nu))
-            for a in range(m.nactuator):
-                for u in range(m.actuator_ctrladr[a], m.actuator_ctrladr[a] + m.actuator_ctrlnum[a]):
-                    memo[key][:, u] = self._sample(self._signal(recording, a, u), window, step, count)
-        ctrl = memo[key]
-        if changed:
-            ctrl = ctrl.copy()
-            for name, effects in changed.items():
-                a = m.actuator(name).id
-                u = m.actuator_ctrladr[a]
-                key = id(recording), window.first, u, effects
-                if key not in memo:
-                    signal = self._signal(recording, a, u)
-                    for effect, values in effects:
-                        signal = effect.command(signal, m, a, values)
-                    memo[key] = self._sample(signal, window, step, count)
-                ctrl[:, u] = memo[key]
-        return Drive(model, ctrl, qfrc, xfrc, items)
+    def _run_up(self, cases, windows, begin, measures, step):
+        """States (n, ·) of the working model at `begin`, for what the recording does not show of them.
 
-    def _signal(self, recording, a, u):
-        """The nominal Signal of control u of actuator a."""
-        value, m = recording.ctrl[:, u], self.nominal
-        if m.actuator_ctrllimited[a] and m.actuator_ctrlnum[a] == 1:
-            value = np.clip(value, *m.actuator_ctrlrange[a])
-        return Signal(recording.time, value, max(m.actuator_delay[a], m.opt.timestep) if m.actuator_delay[a] > 0 else 0.0)
+        From RUN_UP seconds before, always again from what was recorded, with the hidden
+        coordinates running on; at rest in the middle where nothing was recorded.
+        """
+        n = len(cases)
+        qpos, qvel = np.tile(self.model.qpos0, (n, 1)), np.zeros((n, self.model.nv))
+        recordings = [w.recording for w in windows]
+        if not all(hasattr(r, 'qpos') for r in recordings):
+            return qpos, qvel
+        marks = [begin - back for back in np.arange(RUN_UP[0], 0.0, -RUN_UP[1])] + [begin]
+        marks = [np.maximum(t, [r.time[0] for r in recordings]) for t in marks]
+        for now, then in zip(marks[:-1], marks[1:]):
+            q, v = self._true(*map(np.array, zip(*[recorded_state(self.nominal, r, t) for r, t in zip(recordings, now)])), measures)
+            known = np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1)
+            qpos[np.ix_(known, self.q)], qvel[np.ix_(known, self.v)] = q[known], v[known]
+            steps = np.rint((then - now) / step).astype(int)
+            if steps.any():
+                trajectory = self._trajectory(cases, recordings, now, qpos, qvel, step, steps.max())
+                for state, run in zip((qpos, qvel), trajectory):
+                    run = run[np.arange(n), steps]
+                    state[:] = np.where(np.isfinite(run).all(axis=1, keepdims=True), run, state)
+        return qpos, qvel
 
-    def _sample(self, signal, window, step, count):
-        return signal.sample(window.recording.time[window.first], step, count, self.nominal.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4))
+    def _trajectory(self, cases, recordings, begin, qpos, qvel, step, count, sensors=False):
+        """Every step from states qpos (n, nq), qvel (n, nv) of the working model at times `begin` (n,).
 
-    def _activation(self, window):
-        """Activations (na,) at a window's first row, run on from the recorded control."""
-        act, m = np.zeros(self.model.na), self.model
-        for a in range(self.nominal.nactuator):
-            i, kind = m.actuator_actadr[a], m.actuator_dyntype[a]
-            signal = self._signal(window.recording, a, self.nominal.actuator_ctrladr[a])
-            t = np.array([window.recording.time[window.first] - signal.delay])
-            if i >= 0 and kind in FILTERS:
-                act[i] = Signal(signal.time, signal.value, lag=max(m.actuator_dynprm[a, 0], 1e-10)).filtered(t)[0]
-            elif i >= 0 and kind == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # from zero at the first row
-                limits = m.actuator_actrange[a] if m.actuator_actlimited[a] else (-np.inf, np.inf)
-                act[i] = np.clip(signal.integral(np.maximum(t, signal.time[0]))[0], *limits)
-        return act
+        Returns q (n, 1 + count, nq), v (n, 1 + count, nv), sensordata (n, 1 + count, ·) or None; NaN after
+        the first state of a simulation that failed.
+        """
+        n, memo = len(cases), {}
+        on = [self.working.drive(c.on, r, t, step, count, memo) for c, r, t in zip(cases, recordings, begin)]
+        off = [self.working.drive(c.off, r, t, step, count, memo) if c.when else d for c, r, t, d in zip(cases, recordings, begin, on)]
+        if self.batch is None or self.batch.nsim < n:
+            self.batch = Batch(self.model, 1 << (n - 1).bit_length())
+        batch = self.batch
+        batch.warning[:] = 0
+        batch.state[:n] = self.rest
+        batch.bind('qpos')[:n], batch.bind('qvel')[:n] = qpos, qvel
+        if self.model.na:
+            batch.bind('act')[:n] = [self.working.activation(r, t) for r, t in zip(recordings, begin)]
+        # sensordata belongs to the state before a step, so sensors need one step more
+        record = ('qpos', 'qvel', 'sensordata') if sensors else ('qpos', 'qvel')
+        out = {f: np.full((n, count + sensors, getattr(self.working.data, f).size), np.nan) for f in record}
+        if cases[0].stepwise:
+            failed = self._step(batch, cases, recordings, on, off, begin, step, out)
+        else:
+            failed = self._rollout(batch, on, out)
+        failed |= batch.warning[:n, :, 1].any(axis=1)
+        failed |= np.array([a.model is None or b.model is None for a, b in zip(on, off)])
+        q = np.concatenate([qpos[:, None], out['qpos'][:, :count]], axis=1)
+        v = np.concatenate([qvel[:, None], out['qvel'][:, :count]], axis=1)
+        q[failed, 1:] = v[failed, 1:] = np.nan
+        if sensors:
+            out['sensordata'][failed] = np.nan
+        return q, v, out.get('sensordata')
 
     def _rollout(self, batch, drives, out):
         """Run all steps in one call; fill out, return which simulations failed (n,)."""
@@ -212,17 +148,16 @@ class Engine:
             failed[error.ids] = True
         return failed
 
-    def _step(self, batch, cases, windows, on, off, step, out):
+    def _step(self, batch, cases, recordings, on, off, begin, step, out):
         """As _rollout, with forces that depend on the state and conditions looked at before each step."""
         n, failed = len(cases), np.zeros(len(cases), bool)
         ids, spare = np.arange(n), [self.model] * (batch.nsim - n)
         live = {f: batch.bind(f) for f in {'qpos', 'qvel', 'ctrl', 'qfrc_applied', 'xfrc_applied', *out}}
         ctrl, qfrc, xfrc = ([np.array([getattr(d, f) for d in drives]) for drives in (on, off)] for f in ('ctrl', 'qfrc', 'xfrc'))
         forces = [self._forces(drives) for drives in (on, off)]
-        holds, active = self._conditions(cases, windows), None
-        start = np.array([w.recording.time[w.first] for w in windows])
+        holds, active = self._conditions(cases, recordings), None
         for k in range(out['qpos'].shape[1]):
-            time = start + k * step
+            time = begin + k * step
             now = holds(live['qpos'][:n], live['qvel'][:n], time)
             if active is None or (now != active).any():
                 active = now
@@ -259,13 +194,13 @@ class Engine:
                 forces.append((ids, function))
         return forces
 
-    def _conditions(self, cases, windows):
+    def _conditions(self, cases, recordings):
         """A function (qpos, qvel, time) -> (n,): whether each simulation's conditional effects act."""
         always, groups = np.ones(len(cases), bool), {}
-        for s, (case, window) in enumerate(zip(cases, windows)):
+        for s, (case, recording) in enumerate(zip(cases, recordings)):
             for key, bounds in (case.when or {}).items():
                 if key == 'recording':
-                    always[s] = bounds == window.recording.name
+                    always[s] = bounds == recording.name
                 else:
                     groups.setdefault(key, []).append((s, *bounds))
         groups = {key: [np.array(x) for x in zip(*members)] for key, members in groups.items()}
@@ -274,20 +209,20 @@ class Engine:
             active = always.copy()
             for key, (ids, low, high) in groups.items():
                 kind, _, joint = key.partition(':')
-                x = time if kind == 'time' else qpos[:, self.model.joint(joint).qposadr[0]] if kind == 'qpos' else qvel[:, self.model.joint(joint).dofadr[0]]
+                if kind == 'time':
+                    x = time
+                elif kind == 'qpos':
+                    x = qpos[:, self.model.joint(joint).qposadr[0]]
+                else:
+                    x = qvel[:, self.model.joint(joint).dofadr[0]]
                 active[ids] &= (x[ids] >= low) & (x[ids] < high)
             return active
         return holds
 
-    def _simple(self):
-        """Addresses in qpos and in qvel of the nominal hinges and slides."""
-        simple = ~np.isin(self.nominal.jnt_type, (FREE, BALL))
-        return self.nominal.jnt_qposadr[simple], self.nominal.jnt_dofadr[simple]
-
     def _measures(self, cases):
         """(offset, ratio, delay) (3, n, ·) of the hinges and slides, and of sensordata."""
         m = self.nominal
-        simple_q, _ = self._simple()
+        simple_q, _ = simple(m)
         measures = [np.zeros((3, len(cases), width)) for width in (len(simple_q), m.nsensordata)]
         for measure in measures:
             measure[1] = 1.0
@@ -302,3 +237,19 @@ class Engine:
                         part = measures[0][:, s, np.flatnonzero(simple_q == m.joint(candidate.place.name).qposadr[0])[0]]
                     part[0], part[1], part[2] = part[0] + offset, part[1] * ratio, part[2] + delay
         return measures
+
+
+def simple(model):
+    """Addresses in qpos and in qvel of the hinges and slides."""
+    joints = ~np.isin(model.jnt_type, (FREE, BALL))
+    return model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+
+
+def recorded_state(model, recording, t):
+    """qpos (nq,) and qvel (nv,) at the row nearest to time t: velocities as measured, else over the rows around it."""
+    row = int(np.argmin(abs(recording.time - t)))
+    a, b, qvel = max(row - 1, 0), min(row + 1, len(recording.time) - 1), np.full(model.nv, np.nan)
+    if b > a:
+        mujoco.mj_differentiatePos(model, qvel, recording.time[b] - recording.time[a], recording.qpos[a], recording.qpos[b])
+    measured = getattr(recording, 'qvel', None)
+    return recording.qpos[row], qvel if measured is None else np.where(np.isfinite(measured[row]), measured[row], qvel)

@@ -8,17 +8,17 @@ from signals import SLACK
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 
-def read(model, q, v, time, step, simple_q, simple_v, delay):
+def read(model, q, v, time, step, delay):
     """qpos (n, rows, nq), qvel (n, rows, nv) at times (n, rows) after the first state; NaN where time is.
 
     q (n, 1 + count, nq), v: the trajectory at every step. Between steps, positions follow
     the cubic through positions and velocities, velocities the line, quaternions the
-    normalized line. delay (n, simple): columns simple_q, simple_v are read that much
-    earlier; before the first state they moved as in it.
+    normalized line. delay (n, hinges and slides): these are read that much earlier,
+    but not before the first state.
     """
     missing = np.isnan(time)
-    x = np.where(missing, 0.0, time) / step
-    s, k, f = _locate(x, q.shape[1])
+    x = time / step
+    s, k, f = locate(x, q.shape[1])
     qpos, qvel = q[s, k], v[s, k]
     if f.any():
         after, g = np.minimum(k + 1, q.shape[1] - 1), f[..., None]
@@ -31,22 +31,25 @@ def read(model, q, v, time, step, simple_q, simple_v, delay):
                 a += 3
             if model.jnt_type[j] in (FREE, BALL):
                 qpos[..., a:a + 4] /= np.linalg.norm(qpos[..., a:a + 4], axis=-1, keepdims=True)
-    for c, (a, d) in enumerate(zip(simple_q, simple_v)):
+    hinges_and_slides = np.flatnonzero(~np.isin(model.jnt_type, (FREE, BALL)))
+    for c, j in enumerate(hinges_and_slides):
+        a, d = model.jnt_qposadr[j], model.jnt_dofadr[j]
         if f.any() or delay[:, c].any():
-            late = x - delay[:, c, None] / step
-            s, k, part = _locate(np.maximum(late, 0.0), q.shape[1])
+            s, k, part = locate(np.maximum(x - delay[:, c, None] / step, 0.0), q.shape[1])
             after = np.minimum(k + 1, q.shape[1] - 1)
-            qpos[..., a] = _cubic(q[..., a], v[..., d], s, k, part, step) + np.minimum(late, 0.0) * step * v[:, :1, d]
+            qpos[..., a] = _cubic(q[..., a], v[..., d], s, k, part, step)
             qvel[..., d] = (1 - part) * v[s, k, d] + part * v[s, after, d]
     qpos[missing] = qvel[missing] = np.nan
     return qpos, qvel
 
 
-def _locate(x, length):
-    """Simulation, step and fraction of a step (0 within SLACK of a step) of times x (n, rows), in steps."""
+def locate(x, length):
+    """Simulation, step and fraction of a step (0 within SLACK of a step) of times x (n, ...), in steps; all of x's shape."""
+    x = np.nan_to_num(x)
     k = np.clip(np.floor(x + SLACK).astype(int), 0, length - 1)
     fraction = np.where(abs(x - k) <= 1.5 * SLACK, 0.0, x - k)
-    return np.broadcast_to(np.arange(len(x))[:, None], x.shape), k, fraction
+    s = np.arange(len(x)).reshape(-1, *[1] * (x.ndim - 1))
+    return np.broadcast_to(s, x.shape), k, fraction
 
 
 def _cubic(q, v, s, k, f, step):

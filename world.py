@@ -157,7 +157,7 @@ class World:
                 for k in range(0, len(members), chunk):
                     ids, chosen = zip(*members[k:k + chunk])
                     ids = list(ids)
-                    run = engine.run(chosen, start_qpos[ids], start_qvel[ids], [windows[s] for s in ids], rows, step, count, stepwise, sensors)
+                    run = engine.run(chosen, start_qpos[ids], start_qvel[ids], [windows[s] for s in ids], rows, step, count, sensors)
                     for whole, part in zip(out, run):
                         whole[ids] = part
         return tuple(out) if sensors else tuple(out[:2])
