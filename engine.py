@@ -5,6 +5,8 @@ a whole window is one call of mujoco.batch.Batch; only forces that depend on the
 state and effects under a condition are worked out step by step.
 """
 
+import os
+
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
@@ -111,7 +113,7 @@ class Engine:
         on = [self.working.drive(c.on, r, t, step, count, memo) for c, r, t in zip(cases, recordings, begin)]
         off = [self.working.drive(c.off, r, t, step, count, memo) if c.when else d for c, r, t, d in zip(cases, recordings, begin, on)]
         if self.batch is None or self.batch.nsim < n:
-            self.batch = Batch(self.model, 1 << (n - 1).bit_length())
+            self.batch = Batch(self.model, 1 << (n - 1).bit_length(), threads())
         batch = self.batch
         batch.warning[:] = 0
         batch.state[:n] = self.rest
@@ -237,6 +239,12 @@ class Engine:
                         part = measures[0][:, s, np.flatnonzero(simple_q == m.joint(candidate.place.name).qposadr[0])[0]]
                     part[0], part[1], part[2] = part[0] + offset, part[1] * ratio, part[2] + delay
         return measures
+
+
+def threads():
+    """Threads to run on: OMP_NUM_THREADS, where that is set as for other numerical libraries, else all CPUs (0)."""
+    number = os.environ.get('OMP_NUM_THREADS', '')
+    return int(number) if number.isdigit() else 0
 
 
 def simple(model):
