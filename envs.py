@@ -16,7 +16,6 @@ from pathlib import Path
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium.envs import mujoco as gym_mujoco
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -93,7 +92,7 @@ def task_of(env_id):
 
 def model_path(env_id):
     """Path of the MJCF file that gymnasium ships for env_id."""
-    return Path(gym_mujoco.__file__).parent / "assets" / task_of(env_id).xml
+    return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / task_of(env_id).xml
 
 
 # --- the "real" world: the sim with named changes ---------------------------------------------------

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
+import events
 import evidence
 import scores
 import selection
@@ -58,24 +59,19 @@ def identify(world, train, held_out, progress=None):
     say = progress or (lambda done, message: None)
     say(0.0, "estimating noise")
     position_noise, velocity_noise = noise_of(world, train)
-    data = world, train, position_noise, velocity_noise
-    hypothesis, ranking, span = shooting.Hypothesis(), [], 0.0
-    for i in range(ROUNDS):
-        say(0.05 + 0.2 * i, "choosing windows")
-        longer = span_for(*data, hypothesis, at_least=span)
-        if i and longer < 1.5 * span:
+    event, hypothesis = None, shooting.Hypothesis()
+    for attempt in range(2):  # what came and went for a while would be mistaken for something that always acts
+        data = world, train, position_noise, velocity_noise, event
+        problem = problem_of(*data, LEFTOVER_SPANS[0], FINAL_STEPS)
+        found = None if event else events.find(world, problem, shooting.fit_starts(problem, hypothesis))
+        event = event or found
+        if attempt and not found:
             break
-        span = longer
-        problem = problem_of(*data, span, SEARCH_STEPS)
-        say(0.1 + 0.2 * i, f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
-        search = selection.Search(world, problem, train)
-        fit = shooting.fit_starts(problem, hypothesis)
-        if hypothesis.effects:
-            [fit] = shooting.solve(problem, [hypothesis], fit)
-            fit = search.drop(fit, ())
-        fit, _ = search.run(fit)
+        data = world, train, position_noise, velocity_noise, event
+        search, fit, ranking, span = searched(data, say)
         hypothesis = fit.hypothesis
-        ranking = ranking or search.ranking
+        if event:
+            break
     say(0.6, "alternatives")
     fit, possible = search.settle(fit)
     hypothesis = fit.hypothesis
@@ -87,8 +83,31 @@ def identify(world, train, held_out, progress=None):
     if hypothesis.effects:
         [fit] = shooting.solve(final, [hypothesis], fit)
     say(0.9, "held-out error")
-    return assemble(world, train, held_out, fit, selection.Search(world, final, train), possible, left, ranking,
+    return assemble(world, train, held_out, fit, selection.Search(world, final, train), possible, left, event, ranking,
                     position_noise, velocity_noise)
+
+
+def searched(data, say):
+    """Rounds of search with longer and longer windows: (Search, Fit, first ranking, last span)."""
+    world, train = data[:2]
+    hypothesis, ranking, span = shooting.Hypothesis(), [], 0.0
+    for i in range(ROUNDS):
+        say(0.05 + 0.15 * i, "choosing windows")
+        longer = span_for(*data, hypothesis, at_least=span)
+        if i and longer < 1.5 * span:
+            break
+        span = longer
+        problem = problem_of(*data, span, SEARCH_STEPS)
+        say(0.1 + 0.15 * i, f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
+        search = selection.Search(world, problem, train)
+        fit = shooting.fit_starts(problem, hypothesis)
+        if hypothesis.effects:
+            [fit] = shooting.solve(problem, [hypothesis], fit)
+            fit = search.drop(fit, ())
+        fit, _ = search.run(fit)
+        hypothesis = fit.hypothesis
+        ranking = ranking or search.ranking
+    return search, fit, ranking, span
 
 
 # ---- data --------------------------------------------------------------------------------------
@@ -105,7 +124,7 @@ def noise_of(world, train):
         raise RecordingError("not enough data: recordings need at least ten measured rows in some qpos column")
     sample = np.median([np.median(np.diff(r.time)) for r in train])
     for _ in range(2):
-        problem = problem_of(world, train, position, velocity, LEAST_ROWS * sample, SEARCH_STEPS)
+        problem = problem_of(world, train, position, velocity, None, LEAST_ROWS * sample, SEARCH_STEPS)
         fit = shooting.fit_starts(problem, shooting.Hypothesis())
         weight = problem.weight
         square = np.where(weight > 0, fit.residual[:, :weight[0].size].reshape(weight.shape) / np.where(weight > 0, weight, 1), 0) ** 2
@@ -118,12 +137,13 @@ def noise_of(world, train):
     return position, velocity
 
 
-def windows_for(world, recordings, span, steps):
+def windows_for(world, recordings, span, steps, event=None):
     """Windows of span seconds spread evenly over the recordings, at most `steps` simulated steps in all."""
     every = []
     for r in recordings:
         sample = np.median(np.diff(r.time))
         every += cut.consecutive(r, max(span, LEAST_ROWS * sample))
+    every = events.without(every, event) if event else every
     duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
     number = max(LEAST_WINDOWS, int(steps / dear(world.model) * world.model.opt.timestep / duration))
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]
@@ -135,8 +155,8 @@ def dear(model):
     return (6 + model.nv) / 8 * (3.0 if runge_kutta else 1.0)
 
 
-def problem_of(world, recordings, position_noise, velocity_noise, span, steps):
-    return shooting.Problem(world, windows_for(world, recordings, span, steps), position_noise, velocity_noise)
+def problem_of(world, recordings, position_noise, velocity_noise, event, span, steps):
+    return shooting.Problem(world, windows_for(world, recordings, span, steps, event), position_noise, velocity_noise)
 
 
 def follows(problem, fit, share_allowed):
@@ -151,7 +171,7 @@ def follows(problem, fit, share_allowed):
     return bool(np.nanmedian(share) < share_allowed)
 
 
-def span_for(world, train, position_noise, velocity_noise, hypothesis, at_least=0.0):
+def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at_least=0.0):
     """The longest window span that the model with a hypothesis follows, from a few samples up.
 
     Up to LONGEST (or a few dozen rows) while the residual is a few noises; where recordings are far more precise than
@@ -165,7 +185,7 @@ def span_for(world, train, position_noise, velocity_noise, hypothesis, at_least=
     longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration))
 
     def followed(span):
-        problem = problem_of(world, train, position_noise, velocity_noise, span, SEARCH_STEPS / 4)
+        problem = problem_of(world, train, position_noise, velocity_noise, event, span, SEARCH_STEPS / 4)
         return follows(problem, shooting.fit_starts(problem, hypothesis), FOLLOWS_SHARE if span < 0.6 * cut.HORIZON else 0.0)
 
     span = float(np.clip(cut.HORIZON / 2, shortest, longest))
@@ -246,7 +266,7 @@ def noise_by_channel(model, position_noise):
             if np.isfinite(position_noise[dofs]).all()}
 
 
-def assemble(world, train, held_out, fit, search, possible, left, ranking, position_noise, velocity_noise):
+def assemble(world, train, held_out, fit, search, possible, left, event, ranking, position_noise, velocity_noise):
     settings, model = fit.hypothesis.settings, world.model
     noise = evidence.reporting_noise(position_noise)
     bounds = intervals(search, fit)
@@ -268,6 +288,8 @@ def assemble(world, train, held_out, fit, search, possible, left, ranking, posit
         findings.append({"effect": "unknown", "place": {"kind": "joint", "name": left.joint}, "parameters": [],
                          "evidence": {"held_out_error_removed": 0.0, "p_value": left.p_value, "residual_explained": left.share},
                          "depends_on": list(left.variables), "when": None, "written_as": "none", "also_possible": []})
+    if event:
+        findings.append(event_finding(event, train))
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
                "held_out": figure(world, settings, held, position_noise, velocity_noise)}
@@ -280,6 +302,16 @@ def assemble(world, train, held_out, fit, search, possible, left, ranking, posit
                                "place": None, "depends_on": []}}
     return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
                      [], [], train, held)
+
+
+def event_finding(event, train):
+    local = selection.Search(event.problem.world, event.problem, train)
+    candidate = event.candidate
+    named = lambda c, values, bounds=None: {"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, values, bounds)}
+    return {**named(candidate, event.values, intervals(local, event.fit)[candidate]),
+            "evidence": {"held_out_error_removed": 0.0, "p_value": event.p_value},
+            "depends_on": ["time"], "when": event.when, "written_as": "none",
+            "also_possible": [named(c, values) for c, values in event.others]}
 
 
 def figure(world, settings, recordings, position_noise, velocity_noise):

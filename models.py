@@ -168,7 +168,7 @@ class Regressor(nn.Module):
     def forward(self, x):
         return self.outputs.inverse(self.net(self.inputs(x)))
 
-    def fit(self, x, y, generator, max_updates=10_000, patience=10, batch_size=256, lr=1e-3):
+    def fit(self, x, y, generator, max_updates=5_000, patience=10, batch_size=256, lr=1e-3):
         """Least squares with Adam, for at most max_updates minibatches; stops earlier when the held-out fifth
         has not improved for `patience` epochs.
 

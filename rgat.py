@@ -23,7 +23,7 @@ from models import ForwardModel, GaussianPolicy, InverseModel, Value
 from trpo import TRPO, TRPOConfig, rollouts
 
 # section IV-D: the action transformer's own trust region, entropy and discount
-AT_CONFIG = TRPOConfig(batch_size=1024, max_kl=1e-4, entropy=1e-5, gamma=0.99, lam=0.95)
+AT_CONFIG = TRPOConfig(batch_size=1024, max_kl=1e-3, entropy=1e-5, gamma=0.0)
 
 
 def identity(obs, action):
