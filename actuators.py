@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from effects import HUGE, JOINT_TRANSMISSION, Effect, Parameter, catalogue, constant_force, turns
+from effects import HUGE, JOINT_TRANSMISSION, Effect, Parameter, catalogue, constant_force, runge_kutta, turns
 
 
 class ActuatorEffect(Effect):
@@ -46,10 +46,6 @@ class ActuatorEffect(Effect):
         actuator.type = mujoco.mjtActuator.mjACTUATOR_GENERAL
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         return actuator
-
-
-def runge_kutta(model):
-    return model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def refine(spec, longest):

@@ -164,6 +164,11 @@ def turns(model, j):
     return model.jnt_type[j] == HINGE
 
 
+def runge_kutta(model):
+    """Whether forces are evaluated several times in a step."""
+    return model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
+
+
 def angle(spec, model, j, value):
     """A position of joint j as the spec writes it."""
     return np.rad2deg(value) if spec.compiler.degree and turns(model, j) else value

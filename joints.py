@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from effects import (HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Candidate, Effect, Parameter, Place, angle, catalogue, constant_force, passive,
-                     turns)
+from effects import (HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Candidate, Effect, Parameter, Place, angle, catalogue,
+                     constant_force, passive, runge_kutta, turns)
 
 # frictionloss as a nearly rigid constraint: with MuJoCo's default a stuck joint creeps
 SOLREF_FRICTION = (0.004, 1.0)
@@ -37,82 +37,89 @@ class JointEffect(Effect):
         return position[np.isfinite(position)], abs(speed[np.isfinite(speed)])
 
 
+class JointNumber(JointEffect):
+    """An effect that is one number of the joint, in the compiled model and in the spec."""
+    number = '', '', ''      # name; unit for a hinge, for a slide
+    compiled = '', None      # field of the model by dof (or jnt_*, by joint); column, if it has several
+    authored = '', None      # attribute of the spec's joint; its component, if it has several
+    step, signed = 0.02, False
+
+    def _field(self, model, i):
+        name, column = self.compiled
+        row = i if name.startswith('jnt') else model.jnt_dofadr[i]
+        return getattr(model, name), row if column is None else (row, column)
+
+    def parameters(self, model, i):
+        (name, *units), (field, k), M = self.number, self._field(model, i), self.scale(model, i)
+        low = -HUGE * M if self.signed else 0.0
+        return Parameter(name, self.unit(model, i, *units), field[k], low, HUGE * M, max(self.step * M, 0.01 * abs(field[k]))),
+
+    def edit(self, model, i, values):
+        field, k = self._field(model, i)
+        field[k] = values[0]
+
+    def write(self, spec, model, i, values):
+        joint, (attribute, component) = spec.joint(model.joint(i).name), self.authored
+        if component is None:
+            setattr(joint, attribute, values[0])
+        else:
+            getattr(joint, attribute)[component] = values[0]
+        return 'mjcf'
+
+
 @catalogue
-class Armature(JointEffect):
+class Armature(JointNumber):
     """Inertia of rotor and gears, in the joint's own coordinate."""
     name, constants, related = 'armature', True, ('mass', 'gain')
-
-    def parameters(self, model, i):
-        M = self.scale(model, i)
-        return Parameter('armature', self.unit(model, i, 'kg·m²', 'kg'), model.dof_armature[model.jnt_dofadr[i]], 0.0, HUGE * M, 0.01 * M),
-
-    def edit(self, model, i, values):
-        model.dof_armature[model.jnt_dofadr[i]] = values[0]
-
-    def write(self, spec, model, i, values):
-        spec.joint(model.joint(i).name).armature = values[0]
-        return 'mjcf'
+    number, compiled, authored, step = ('armature', 'kg·m²', 'kg'), ('dof_armature', None), ('armature', None), 0.01
 
 
 @catalogue
-class ViscousDamping(JointEffect):
+class ViscousDamping(JointNumber):
     """Force −d·v."""
     name, simplicity, related = 'viscous_damping', 0, DISSIPATION
-
-    def parameters(self, model, i):
-        M, nominal = self.scale(model, i), model.dof_damping[model.jnt_dofadr[i]]
-        return Parameter('damping', self.unit(model, i, 'N·m·s/rad', 'N·s/m'), nominal, 0.0, HUGE * M, max(0.02 * M, 0.01 * nominal)),
-
-    def edit(self, model, i, values):
-        model.dof_damping[model.jnt_dofadr[i]] = values[0]
-
-    def write(self, spec, model, i, values):
-        spec.joint(model.joint(i).name).damping[0] = values[0]
-        return 'mjcf'
+    number, compiled, authored = ('damping', 'N·m·s/rad', 'N·s/m'), ('dof_damping', None), ('damping', 0)
 
 
 @catalogue
-class QuadraticDamping(JointEffect):
+class QuadraticDamping(JointNumber):
     """Force −d·v·|v|."""
     name, related = 'quadratic_damping', DISSIPATION
-
-    def parameters(self, model, i):
-        M, nominal = self.scale(model, i), model.dof_dampingpoly[model.jnt_dofadr[i], 0]
-        return Parameter('damping2', self.unit(model, i, 'N·m·s²/rad²', 'N·s²/m²'), nominal, 0.0, HUGE * M, max(0.02 * M, 0.01 * nominal)),
-
-    def edit(self, model, i, values):
-        model.dof_dampingpoly[model.jnt_dofadr[i], 0] = values[0]
-
-    def write(self, spec, model, i, values):
-        spec.joint(model.joint(i).name).damping[1] = values[0]
-        return 'mjcf'
-
-
-def _set_frictionloss(model, i, value):
-    d = model.jnt_dofadr[i]
-    if not model.dof_frictionloss[d]:  # else the nominal model's own softness counts
-        model.dof_solref[d], model.dof_solimp[d] = SOLREF_FRICTION, SOLIMP_FRICTION
-    model.dof_frictionloss[d] = value
+    number, compiled, authored = ('damping2', 'N·m·s²/rad²', 'N·s²/m²'), ('dof_dampingpoly', 0), ('damping', 1)
 
 
 @catalogue
-class CoulombFriction(JointEffect):
+class CoulombFriction(JointNumber):
     """Dry friction, which holds the joint below its limit."""
     name, simplicity, related = 'coulomb_friction', 0, DISSIPATION
-
-    def parameters(self, model, i):
-        M, nominal = self.scale(model, i), model.dof_frictionloss[model.jnt_dofadr[i]]
-        return Parameter('frictionloss', self.unit(model, i, 'N·m', 'N'), nominal, 0.0, HUGE * M, max(0.05 * M, 0.01 * nominal)),
+    number, compiled, authored, step = ('frictionloss', 'N·m', 'N'), ('dof_frictionloss', None), ('frictionloss', None), 0.05
 
     def edit(self, model, i, values):
-        _set_frictionloss(model, i, values[0])
+        d = model.jnt_dofadr[i]
+        if not model.dof_frictionloss[d]:  # else the nominal model's own softness counts
+            model.dof_solref[d], model.dof_solimp[d] = SOLREF_FRICTION, SOLIMP_FRICTION
+        super().edit(model, i, values)
 
     def write(self, spec, model, i, values):
         joint = spec.joint(model.joint(i).name)
         if not joint.frictionloss:
             joint.solref_friction, joint.solimp_friction = SOLREF_FRICTION, SOLIMP_FRICTION
-        joint.frictionloss = values[0]
-        return 'mjcf'
+        return super().write(spec, model, i, values)
+
+
+@catalogue
+class Stiffness(JointNumber):
+    """Force −k·(q − springref)."""
+    name, related = 'stiffness', ('spring_offset', 'nonlinear_stiffness', 'gain')
+    number, compiled, authored, step = ('stiffness', 'N·m/rad', 'N/m'), ('jnt_stiffness', None), ('stiffness', 0), 0.1
+
+
+@catalogue
+class NonlinearStiffness(JointNumber):
+    """Force −k·(q − springref)³."""
+    name, simplicity, related = 'nonlinear_stiffness', 2, ('stiffness', 'spring_offset')
+    number, compiled, authored = ('stiffness3', 'N·m/rad³', 'N/m³'), ('jnt_stiffnesspoly', 1), ('stiffness', 2)
+    step, signed = 0.1, True
 
 
 @catalogue
@@ -126,15 +133,17 @@ class StribeckFriction(JointEffect):
 
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, 'N·m', 'N')
-        return (Parameter('coulomb', force, 0.0, 0.0, HUGE * M, 0.05 * M), Parameter('static', force, 0.0, 0.0, HUGE * M, 0.05 * M),
+        return (Parameter('coulomb', force, 0.0, 0.0, HUGE * M, 0.05 * M),
+                Parameter('static', force, 0.0, 0.0, HUGE * M, 0.05 * M),
                 Parameter('velocity', self.unit(model, i, 'rad/s', 'm/s'), 0.1, 1e-4, 100.0, 0.01))
 
     def probes(self, model, i, recordings):
         step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
-        return np.array([(step, ratio * step, v) for v in np.quantile(speed, [0.2, 0.5]) + 1e-4 for ratio in (1.5, 3.0)])
+        slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
+        return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
 
     def edit(self, model, i, values):
-        _set_frictionloss(model, i, values[1])
+        CoulombFriction().edit(model, i, values[1:2])
 
     def force(self, models, i, values):
         d = models[0].jnt_dofadr[i]
@@ -151,44 +160,11 @@ class StribeckFriction(JointEffect):
         joint, h = model.joint(i).name, spec.option.timestep
         M = 1 / model.dof_invweight0[model.jnt_dofadr[i]]  # what the joint feels, its neighbours free
         stiffness, damping = 0.1 * M / h**2, 0.0
-        if spec.option.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):  # also explodes where they relax within a step
+        if runge_kutta(model):  # also explodes where they relax within a step
             stiffness = min(0.01 * M / h**2, values[0] / (h * max(3.0, 10 * values[2])))
             damping = np.sqrt(stiffness * M)
-        passive(spec, f'stribeck_friction:{joint}', JOINT_TRANSMISSION, joint, lugre=[stiffness, damping, *values])
-        return 'mjcf'
-
-
-@catalogue
-class Stiffness(JointEffect):
-    """Force −k·(q − springref)."""
-    name, related = 'stiffness', ('spring_offset', 'nonlinear_stiffness', 'gain')
-
-    def parameters(self, model, i):
-        M, nominal = self.scale(model, i), model.jnt_stiffness[i]
-        return Parameter('stiffness', self.unit(model, i, 'N·m/rad', 'N/m'), nominal, 0.0, HUGE * M, max(0.1 * M, 0.01 * nominal)),
-
-    def edit(self, model, i, values):
-        model.jnt_stiffness[i] = values[0]
-
-    def write(self, spec, model, i, values):
-        spec.joint(model.joint(i).name).stiffness[0] = values[0]
-        return 'mjcf'
-
-
-@catalogue
-class NonlinearStiffness(JointEffect):
-    """Force −k·(q − springref)³."""
-    name, simplicity, related = 'nonlinear_stiffness', 2, ('stiffness', 'spring_offset')
-
-    def parameters(self, model, i):
-        M, nominal = self.scale(model, i), model.jnt_stiffnesspoly[i, 1]
-        return Parameter('stiffness3', self.unit(model, i, 'N·m/rad³', 'N/m³'), nominal, -HUGE * M, HUGE * M, max(0.1 * M, 0.01 * abs(nominal))),
-
-    def edit(self, model, i, values):
-        model.jnt_stiffnesspoly[i, 1] = values[0]
-
-    def write(self, spec, model, i, values):
-        spec.joint(model.joint(i).name).stiffness[2] = values[0]
+        lugre = [stiffness, damping, *values]
+        passive(spec, f'stribeck_friction:{joint}', JOINT_TRANSMISSION, joint, lugre=lugre)
         return 'mjcf'
 
 
@@ -222,18 +198,20 @@ class Cogging(JointEffect):
     def parameters(self, model, i):
         M = self.scale(model, i)
         return (Parameter('amplitude', self.unit(model, i, 'N·m', 'N'), 0.0, -HUGE * M, HUGE * M, 0.05 * M),
-                Parameter('poles', self.unit(model, i, '1', 'rad/m'), 6.0, 0.1, 1e5, 0.1), Parameter('phase', 'rad', 0.0, -10.0, 10.0, 0.1))
+                Parameter('poles', self.unit(model, i, '1', 'rad/m'), 6.0, 0.1, 1e5, 0.1),
+                Parameter('phase', 'rad', 0.0, -10.0, 10.0, 0.1))
 
     def probes(self, model, i, recordings):
         position, _ = self.travel(model, i, recordings)
         base = 1.0 if turns(model, i) else 2 * np.pi / max(np.ptp(position), 1e-3)
-        return np.array([(0.05 * self.scale(model, i), base * n, phase) for n in (2, 3, 4, 6, 8, 12, 16, 24, 36) for phase in (0.0, np.pi / 2)])
+        poles = base * np.array([2, 3, 4, 6, 8, 12, 16, 24, 36])
+        return np.array([(0.05 * self.scale(model, i), n, phase) for n in poles for phase in (0.0, np.pi / 2)])
 
     def _motor(self, model, i):
         return f'cogging:{model.joint(i).name}'
 
     def build(self, spec, model, i):
-        passive(spec, self._motor(model, i), JOINT_TRANSMISSION, model.joint(i).name, cogging=[1.0, 1.0, 0.0])
+        self.write(spec, model, i, (1.0, 1.0, 0.0))
 
     def edit(self, model, i, values):
         model.actuator_biasprm[model.actuator(self._motor(model, i)).id, :3] = values
@@ -252,7 +230,8 @@ class JointStop(JointEffect):
     def parameters(self, model, i):
         low, high = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
         unit = self.unit(model, i, 'rad', 'm')
-        return Parameter('low', unit, low, -self.NEVER, self.NEVER, 0.01), Parameter('high', unit, high, -self.NEVER, self.NEVER, -0.01)
+        return (Parameter('low', unit, low, -self.NEVER, self.NEVER, 0.01),
+                Parameter('high', unit, high, -self.NEVER, self.NEVER, -0.01))
 
     def probes(self, model, i, recordings):
         position, _ = self.travel(model, i, recordings)
@@ -276,8 +255,8 @@ class Backlash(JointEffect):
     """Play of width `gap` between motor and load; the sensor sits at the motor.
 
     The recorded joint becomes the motor's; a second one in the same body, limited
-    to ± gap/2 and in the middle at the start of a run, carries the load. The motor side needs inertia of its own: without
-    armature it gets one per cent of the joint's.
+    to ± gap/2 and in the middle at the start of a run, carries the load. The motor side
+    needs inertia of its own: without armature it gets one per cent of the joint's.
     """
     name, simplicity = 'backlash', 3
 
@@ -330,7 +309,8 @@ class Unknown(JointEffect):
 
     def parameters(self, model, i):
         M = self.scale(model, i)
-        return tuple(Parameter(f'force {k}', self.unit(model, i, 'N·m', 'N'), 0.0, -HUGE * M, HUGE * M, 0.05 * M) for k in range(len(self.knots)))
+        force = self.unit(model, i, 'N·m', 'N')
+        return tuple(Parameter(f'force {k}', force, 0.0, -HUGE * M, HUGE * M, 0.05 * M) for k in range(len(self.knots)))
 
     def force(self, models, i, values):
         model, knots = models[0], np.array(self.knots)
@@ -351,7 +331,7 @@ class Unknown(JointEffect):
         return curve
 
     def write(self, spec, model, i, values):
-        """As a constant and a cubic in the joint's own position or velocity, where that is within 5 % of the curve."""
+        """As a constant and a cubic in the joint's own position or velocity, if that is within 5 % of the curve."""
         joint = spec.joint(model.joint(i).name)
         x, y = np.array(self.knots), np.array(values)
         if self.variable == f'velocity:{joint.name}':

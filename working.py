@@ -7,6 +7,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from effects import runge_kutta
 from signals import Signal
 from surroundings import touchable
 
@@ -14,7 +15,6 @@ COPY_BYTES = 50e6  # of edited models kept for the next call
 ROTATES = 1        # body_simple of a simple body with rotations; one that only slides is 2, and feels contacts differently if not simple
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
-RUNGE_KUTTA = int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 class Drive(NamedTuple):
@@ -88,7 +88,7 @@ class Working:
                 candidate.effect.push(qfrc, xfrc, self.model, candidate.effect.id(self.model, candidate.place.name), values)
             memo[key] = self.edited(items, step), qfrc, xfrc, {name: tuple(effects) for name, effects in changed.items()}
         model, qfrc, xfrc, changed = memo[key]
-        m, average = self.nominal, self.nominal.opt.integrator == RUNGE_KUTTA
+        m, average = self.nominal, runge_kutta(self.nominal)
         key = id(recording), start
         if key not in memo:
             memo[key] = np.zeros((count, m.nu))
