@@ -190,7 +190,7 @@ class BatchEnv(VectorEnv):
 
     Args:
       env_id: one of ENV_IDS. num_envs: copies. perturbation: Changes that make this world "real".
-      model: a mujoco.MjModel to run instead of gymnasium's own, with the same joints and actuators.
+      model: a mujoco.MjModel to run instead of gymnasium's own: the same joints, and its actuators first.
       nthread: threads of the simulator's pool, 0 for all cores.
     Raises EnvError: unknown id or name, num_envs < 1, or an unstable simulation (in step).
     """
@@ -203,7 +203,10 @@ class BatchEnv(VectorEnv):
         self.task = task_of(env_id)
         self.env_id, self.num_envs = env_id, num_envs
         self.spec = gymnasium.spec(env_id)
-        self.model = mujoco.MjModel.from_xml_path(str(model_path(env_id))) if model is None else model
+        nominal = mujoco.MjModel.from_xml_path(str(model_path(env_id)))
+        self.model = nominal if model is None else model
+        if self.model.nq != nominal.nq or self.model.nu < nominal.nu:
+            raise EnvError(f"the given model has {self.model.nq} coordinates and {self.model.nu} actuators, {env_id} has {nominal.nq} and {nominal.nu}")
         if perturbation:
             perturb(self.model, perturbation)
         self.dt = self.model.opt.timestep * self.task.frame_skip
@@ -211,14 +214,15 @@ class BatchEnv(VectorEnv):
         self._pays_on_end = env_id.endswith("v4")
 
         self.batch = Batch(self.model, num_envs, nthread)
-        self.qpos, self.qvel, self._ctrl = (self.batch.bind(field) for field in ("qpos", "qvel", "ctrl"))
+        self.qpos, self.qvel, ctrl = (self.batch.bind(field) for field in ("qpos", "qvel", "ctrl"))
+        self._ctrl = ctrl[:, : nominal.nu]
         self._peek = None
         self._init_qpos = self.model.qpos0.copy()
         self._rng = [None] * num_envs
         self.steps = np.zeros(num_envs, int)
 
         nobs = self.model.nq + self.model.nv - self.task.skip_root_x
-        low, high = self.model.actuator_ctrlrange.astype(np.float32).T
+        low, high = nominal.actuator_ctrlrange.astype(np.float32).T
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (nobs,), np.float64)
         self.single_action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -307,7 +311,7 @@ class BatchEnv(VectorEnv):
         if self._peek is None:
             self._peek = Batch(self.model, self.num_envs, self.batch.nthread)
         self._peek.state[:] = self.batch.state
-        self._peek.ctrl = actions
+        self._peek.bind("ctrl")[:, : self._ctrl.shape[1]] = actions
         self._peek.step(nstep=self.task.frame_skip)
         return self.task.observe(self._peek.qpos, self._peek.qvel)
 

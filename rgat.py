@@ -167,6 +167,7 @@ class Grounding:
     """No grounding: the policy goes on learning in the world it is given (the `sim` and `real` lines)."""
 
     learns_from_real = False
+    least_transitions = 0  # real ones per grounding step, whatever the number of episodes
 
     def __init__(self, sim, settings=GroundingSettings()):
         self.sim, self.settings = sim, settings

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from envs import BatchEnv, EnvError, parse_perturbation, task_of
 from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint
 from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, identity, one_step_error
+from remodel import Physics
 from runs import Run, RunError, animate, save_whole, versions, write_whole
 from trpo import PRESETS, TRPO, Transitions, rollouts
 
@@ -42,13 +43,13 @@ class Settings:
     """Everything that decides a run's numbers, but for --out."""
 
     env: str = option("Hopper-v4", "task: InvertedPendulum, Hopper or HalfCheetah, -v4 or -v5")
-    algo: str = option("rgat", "how to ground: rgat, gat, ane, oracle; sim and real train in that world alone", choices=list(METHODS))
+    algo: str = option("rgat", "how to ground: rgat, gat, ane, oracle, physics (diagnose.py); sim and real train in that world alone", choices=[*METHODS, "physics"])
     seed: int = option(0, "seed of everything random")
     real: str = option(None, "what makes the real world differ, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)")
     policy: str = option("deep", "hidden layers of the target policy: deep 2x64, shallow 1x4", choices=["deep", "shallow"])
     pretrain_steps: int = option(None, "steps in the raw sim before the first grounding step (default: by task)")
     grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
-    real_trajectories: int = option(50, "real episodes recorded per grounding step")
+    real_trajectories: int = option(None, "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)")
     at_steps: int = option(None, "sim steps per grounding step for the action transformer (default: by task)")
     policy_steps: int = option(None, "grounded-sim steps per grounding step for the policy (default: by task)")
     eval_episodes: int = option(20, "real episodes per evaluation, deterministic and again stochastic")
@@ -65,7 +66,7 @@ class Settings:
     def completed(self):
         """These settings with the task's defaults filled in. Raises EnvError or RunError for impossible ones."""
         task = task_of(self.env)
-        defaults = {**DEFAULTS[self.env.split("-")[0]], "real": task.real}
+        defaults = {**DEFAULTS[self.env.split("-")[0]], "real": task.real, "real_trajectories": 1 if self.algo == "physics" else 50}
         done = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
         for name, least in COUNTS.items():
             if getattr(done, name) < least:
@@ -120,7 +121,10 @@ def collect(s, grounding, policy, real, seed):
     """tau_real of one grounding step: episodes of the stochastic policy, for the methods that learn from them."""
     if not grounding.learns_from_real:
         return nothing(real)
-    return rollouts(policy, real, s.real_trajectories, seed)[1]
+    tau, episodes = rollouts(policy, real, s.real_trajectories, seed)[1], s.real_trajectories
+    while len(tau) < grounding.least_transitions:
+        tau, episodes = tau + rollouts(policy, real, 1, seed + episodes)[1], episodes + 1
+    return tau
 
 
 def nothing(env):
@@ -169,7 +173,7 @@ def standard_error(x):
 def start(s, run, sim, real, bar):
     """The learner, the grounding and tau_real that the next grounding step goes on from; step 0 if there is none yet."""
     world = real if s.algo == "real" else sim
-    method = METHODS[s.algo]
+    method = Physics if s.algo == "physics" else METHODS[s.algo]
     settings = GroundingSettings(
         at=dataclasses.replace(AT_CONFIG, max_kl=s.at_max_kl, gamma=s.at_gamma, entropy=s.at_entropy), at_std=s.at_std, residual=s.forward_model == "residual", ane_width=s.ane_width
     )

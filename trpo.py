@@ -295,7 +295,8 @@ class EpisodeReturns:
 def rollouts(policy, env, episodes, seed, deterministic=False):
     """Run `episodes` whole episodes of a policy. Returns their undiscounted returns (episodes,) and Transitions.
 
-    Each environment plays one episode after each reset, so that short episodes are not favoured.
+    Each environment plays one episode after each reset, so that short episodes are not favoured. The rows of
+    an episode stand together, in their order in time.
     """
     generator = torch.Generator().manual_seed(seed)
     low, high = env.single_action_space.low, env.single_action_space.high
@@ -311,11 +312,13 @@ def rollouts(policy, env, episodes, seed, deterministic=False):
                 action = np.clip(action.numpy(), low, high)
                 before = obs
                 obs, reward, terminated, truncated, info = env.step(action)
-                rows.append((before[alive], action[alive], info["next_obs"][alive].astype(np.float32)))
+                rows.append((before[alive], action[alive], info["next_obs"][alive].astype(np.float32), np.flatnonzero(alive) + len(returns)))
                 total += reward * alive
                 alive &= ~(terminated | truncated)
             returns += list(total[wanted])
-    return np.array(returns), Transitions(*(np.concatenate(column) for column in zip(*rows)))
+    s, a, s_next, episode = (np.concatenate(column) for column in zip(*rows))
+    order = np.argsort(episode, kind="stable")
+    return np.array(returns), Transitions(s[order], a[order], s_next[order])
 
 
 @dataclass(frozen=True)
