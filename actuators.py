@@ -31,13 +31,15 @@ class ActuatorEffect(Effect):
         asked = [model.actuator_gainprm[i, 0] * r.ctrl[:, model.actuator_ctrladr[i]] for r in recordings]
         if model.actuator_biasprm[i, 1] and model.actuator_trntype[i] == JOINT_TRANSMISSION:
             q = model.jnt_qposadr[model.actuator_trnid[i, 0]]
-            asked = [F + model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0] * r.qpos[:, q] for F, r in zip(asked, recordings)]
+            k = model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0]
+            asked = [F + k * r.qpos[:, q] for F, r in zip(asked, recordings)]
         return abs(np.nan_to_num(np.concatenate(asked)))
 
     @staticmethod
     def unit(model, i):
         """Unit of its force."""
-        return 'N·m' if model.actuator_trntype[i] == JOINT_TRANSMISSION and turns(model, model.actuator_trnid[i, 0]) else 'N'
+        on_joint = model.actuator_trntype[i] == JOINT_TRANSMISSION
+        return 'N·m' if on_joint and turns(model, model.actuator_trnid[i, 0]) else 'N'
 
     @staticmethod
     def general(spec, model, i):
@@ -106,7 +108,8 @@ class BackEmf(ActuatorEffect):
         nominal, step = -model.actuator_biasprm[i, 2], 0.01 * self.strength(model, i)
         if model.actuator_trntype[i] == JOINT_TRANSMISSION:
             step = 0.02 * model.dof_M0[model.jnt_dofadr[model.actuator_trnid[i, 0]]] / model.actuator_gear[i, 0]**2
-        return Parameter('damping', 'N·m·s/rad' if self.unit(model, i) == 'N·m' else 'N·s/m', nominal, 0.0, HUGE * step, max(step, 0.01 * nominal)),
+        unit = {'N·m': 'N·m·s/rad', 'N': 'N·s/m'}[self.unit(model, i)]
+        return Parameter('damping', unit, nominal, 0.0, HUGE * step, max(step, 0.01 * nominal)),
 
     def edit(self, model, i, values):
         model.actuator_biasprm[i, 2] = -values[0]
@@ -123,7 +126,8 @@ class Saturation(ActuatorEffect):
 
     def parameters(self, model, i):
         F = self.strength(model, i)
-        return Parameter('forcerange', self.unit(model, i), F if model.actuator_forcelimited[i] else np.inf, 1e-4 * F, HUGE * F, 0.02 * F),
+        nominal = F if model.actuator_forcelimited[i] else np.inf
+        return Parameter('forcerange', self.unit(model, i), nominal, 1e-4 * F, HUGE * F, 0.02 * F),
 
     def probes(self, model, i, recordings):
         used = self.forces(model, i, recordings).max()
@@ -166,20 +170,20 @@ class Delay(ActuatorEffect):
     name, simplicity, related = 'delay', 0, ('lag', 'sensor_delay', 'time_step')
 
     def parameters(self, model, i):
-        return Parameter('seconds', 's', _nominal_delay(model, i), 0.0, 1.0, 0.001),
+        return Parameter('seconds', 's', nominal_delay(model, i), 0.0, 1.0, 0.001),
 
     def command(self, signal, model, i, values):
         return replace(signal, delay=values[0])
 
     def write(self, spec, model, i, values):
-        """MuJoCo reads its history at the time of each force evaluation, and not later than what the last step left there."""
-        seconds, actuator = values[0], spec.actuator(model.actuator(i).name)
+        """MuJoCo reads its history as of each force evaluation, but only what was there before the step."""
+        seconds, actuator, step = values[0], spec.actuator(model.actuator(i).name), spec.option.timestep
         if runge_kutta(model):  # evaluates half a step later on average, a whole one at the last
             refine(spec, seconds / 1.5)
             seconds += spec.option.timestep / 2
-        elif seconds < spec.option.timestep and actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
-            # a finer step would change the whole simulation: spread the command over following steps, late by as much on average
-            set_lag(self.general(spec, model, i), spec.option.timestep / np.log1p(spec.option.timestep / seconds), model)
+        elif seconds < step and actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
+            # a finer step would change everything: spread the command over later steps, as late on average
+            set_lag(self.general(spec, model, i), step / np.log1p(step / seconds), model)
             return 'mjcf'
         else:
             refine(spec, seconds)
@@ -187,7 +191,8 @@ class Delay(ActuatorEffect):
         return 'mjcf'
 
 
-def _nominal_delay(model, i):
+def nominal_delay(model, i):
+    """Seconds by which the nominal model delays actuator i: MuJoCo rounds a part of a step up to one."""
     return max(model.actuator_delay[i], model.opt.timestep) if model.actuator_delay[i] > 0 else 0.0
 
 
@@ -224,16 +229,17 @@ class DeadZone(ActuatorEffect):
         model = models[0]
         if not self._servo(model, i):
             return None
-        gain, bias = (np.array([getattr(m, f'actuator_{prm}')[i, :3] for m in models]) for prm in ('gainprm', 'biasprm'))
-        limit = np.array([m.actuator_forcerange[i] if m.actuator_forcelimited[i] else (-np.inf, np.inf) for m in models])
+        gain = np.array([m.actuator_gainprm[i, 0] for m in models])
+        bias = np.array([m.actuator_biasprm[i, :3] for m in models])
+        limit = np.array([abs(m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else (np.inf, np.inf) for m in models])
         joint, u, gear = model.actuator_trnid[i, 0], model.actuator_ctrladr[i], model.actuator_gear[i, 0]
         q, d = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
 
         def absorbed(qpos, qvel, ctrl, time):
             length, velocity = gear * qpos[:, q], gear * qvel[:, d]
-            F = gain[:, 0] * ctrl[:, u] + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * velocity
+            F = gain * ctrl[:, u] + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * velocity
             out = np.zeros_like(qvel)
-            out[:, d] = -gear * np.clip(np.clip(F, limit[:, 0], limit[:, 1]), -values[:, 0], values[:, 0])
+            out[:, d] = -gear * np.clip(np.clip(F, -limit[:, 0], limit[:, 1]), -values[:, 0], values[:, 0])
             return out
         return absorbed
 
@@ -241,14 +247,18 @@ class DeadZone(ActuatorEffect):
         """For a motor on a joint: it turns a light wheel against a spring of its own instead, and a tendon whose
         spring has a dead band hands on what is beyond it, about half a time step later, once it is wound up."""
         motor = spec.actuator(model.actuator(i).name)
-        if model.actuator_trntype[i] != JOINT_TRANSMISSION or motor.biasprm[1:3].any() or motor.dyntype != mujoco.mjtDyn.mjDYN_NONE:
+        plain = not motor.biasprm[1:3].any() and motor.dyntype == mujoco.mjtDyn.mjDYN_NONE
+        if model.actuator_trntype[i] != JOINT_TRANSMISSION or not plain:
             return 'none'
-        h, gain, gear, joint, name = spec.option.timestep, abs(motor.gainprm[0]), motor.gear[0], motor.target, f'dead_zone:{motor.name}'
+        h, gain, gear, joint = spec.option.timestep, abs(motor.gainprm[0]), motor.gear[0], motor.target
+        name = f'dead_zone:{motor.name}'
         k = 1e-3 * self.strength(model, i)  # so soft that it travels far, and the joint's own travel adds nothing
         inertia = max(0.5 * k * h**2, 1e-13)  # MuJoCo refuses less than 1e-15
-        body = spec.worldbody.add_body(name=name, mass=1.0, ipos=[0.0] * 3, inertia=[inertia] * 3, explicitinertial=True)  # too dense for air to matter
-        wheel = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, stiffness=[k, 0.0, 0.0], damping=[k * h, 0.0, 0.0])
-        wheel.limited, wheel.armature, wheel.frictionloss, wheel.ref, wheel.springref = mujoco.mjtLimited.mjLIMITED_FALSE, 0.0, 0.0, 0.0, 0.0
+        # heavy for its inertia, that is too dense for air to matter
+        body = spec.worldbody.add_body(name=name, mass=1.0, ipos=[0.0] * 3, inertia=[inertia] * 3, explicitinertial=True)
+        wheel = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, limited=mujoco.mjtLimited.mjLIMITED_FALSE)
+        wheel.armature = wheel.frictionloss = wheel.ref = wheel.springref = 0.0  # whatever the defaults say
+        wheel.stiffness, wheel.damping = [k, 0.0, 0.0], [k * h, 0.0, 0.0]
         edge = gain * values[0] / k
         tendon = spec.add_tendon(name=name, stiffness=[k, 0.0, 0.0], springlength=[-edge, edge])
         tendon.wrap_joint(name, 1.0)

@@ -91,9 +91,9 @@ class Effect:
         """Names of the objects of model where this effect can sit."""
         if self.kind == 'world':
             return ['world'] if self.fits(model, 0) else []
-        count, view = {'body': (model.nbody, model.body), 'joint': (model.njnt, model.joint), 'geom': (model.ngeom, model.geom),
-                       'actuator': (model.nactuator, model.actuator), 'sensor': (model.nsensor, model.sensor)}[self.kind]
-        return [view(i).name for i in range(count) if self.fits(model, i)]
+        count = {'body': model.nbody, 'joint': model.njnt, 'geom': model.ngeom, 'actuator': model.nactuator,
+                 'sensor': model.nsensor}[self.kind]
+        return [getattr(model, self.kind)(i).name for i in range(count) if self.fits(model, i)]
 
     def id(self, model, name):
         """Id of the object of that name in model."""
@@ -113,8 +113,8 @@ class Effect:
         """Values (P, parameters) to try first: by default each parameter a step up, and down where it may."""
         parameters = self.parameters(model, i)
         nominal = [p.nominal for p in parameters]
-        rows = [nominal[:k] + [p.nominal + d] + nominal[k + 1:] for k, p in enumerate(parameters) for d in (p.step, -p.step)
-                if p.low <= p.nominal + d <= p.high]
+        rows = [nominal[:k] + [p.nominal + d] + nominal[k + 1:]
+                for k, p in enumerate(parameters) for d in (p.step, -p.step) if p.low <= p.nominal + d <= p.high]
         return np.array(rows)
 
     def build(self, spec, model, i):

@@ -36,7 +36,7 @@ class Engine:
         """
         measures, sensor_measures = self._measures(cases)
         (offset, ratio, delay), recordings = measures, [w.recording for w in windows]
-        # a window begins as long before its first row as its latest sensor is late; before the recording, it showed its first row
+        # a window begins as long before its first row as its latest sensor is late, but not before the recording
         early = np.maximum(delay.max(axis=1, initial=0.0), sensor_measures[2].max(axis=1, initial=0.0))
         early = np.minimum(early, [w.recording.time[w.first] - w.recording.time[0] for w in windows])
         begin = np.array([w.recording.time[w.first] for w in windows]) - early
@@ -92,7 +92,8 @@ class Engine:
         marks = [begin - back for back in np.arange(RUN_UP[0], 0.0, -RUN_UP[1])] + [begin]
         marks = [np.maximum(t, [r.time[0] for r in recordings]) for t in marks]
         for now, then in zip(marks[:-1], marks[1:]):
-            q, v = self._true(*map(np.array, zip(*[recorded_state(self.nominal, r, t) for r, t in zip(recordings, now)])), measures)
+            recorded = [recorded_state(self.nominal, r, t) for r, t in zip(recordings, now)]
+            q, v = self._true(*map(np.array, zip(*recorded)), measures)
             known = np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1)
             qpos[np.ix_(known, self.q)], qvel[np.ix_(known, self.v)] = q[known], v[known]
             steps = np.rint((then - now) / step).astype(int)
@@ -109,9 +110,9 @@ class Engine:
         Returns q (n, 1 + count, nq), v (n, 1 + count, nv), sensordata (n, 1 + count, ·) or None; NaN after
         the first state of a simulation that failed.
         """
-        n, memo = len(cases), {}
-        on = [self.working.drive(c.on, r, t, step, count, memo) for c, r, t in zip(cases, recordings, begin)]
-        off = [self.working.drive(c.off, r, t, step, count, memo) if c.when else d for c, r, t, d in zip(cases, recordings, begin, on)]
+        n, memo, drive = len(cases), {}, self.working.drive
+        on = [drive(c.on, r, t, step, count, memo) for c, r, t in zip(cases, recordings, begin)]
+        off = [drive(c.off, r, t, step, count, memo) if c.when else d for c, r, t, d in zip(cases, recordings, begin, on)]
         if self.batch is None or self.batch.nsim < n:
             self.batch = Batch(self.model, 1 << (n - 1).bit_length(), threads())
         batch = self.batch
@@ -155,7 +156,8 @@ class Engine:
         n, failed = len(cases), np.zeros(len(cases), bool)
         ids, spare = np.arange(n), [self.model] * (batch.nsim - n)
         live = {f: batch.bind(f) for f in {'qpos', 'qvel', 'ctrl', 'qfrc_applied', 'xfrc_applied', *out}}
-        ctrl, qfrc, xfrc = ([np.array([getattr(d, f) for d in drives]) for drives in (on, off)] for f in ('ctrl', 'qfrc', 'xfrc'))
+        ctrl, qfrc, xfrc = ([np.array([getattr(d, f) for d in drives]) for drives in (on, off)]
+                            for f in ('ctrl', 'qfrc', 'xfrc'))
         forces = [self._forces(drives) for drives in (on, off)]
         holds, active = self._conditions(cases, recordings), None
         for k in range(out['qpos'].shape[1]):
@@ -190,8 +192,9 @@ class Engine:
                     groups.setdefault(candidate, []).append((s, values))
         forces = []
         for candidate, members in groups.items():
-            ids, values = np.array([s for s, _ in members]), np.array([v for _, v in members])
-            function = candidate.effect.force([drives[s].model for s in ids], candidate.effect.id(self.model, candidate.place.name), values)
+            ids, values = map(np.array, zip(*members))
+            i = candidate.effect.id(self.model, candidate.place.name)
+            function = candidate.effect.force([drives[s].model for s in ids], i, values)
             if function is not None:
                 forces.append((ids, function))
         return forces
@@ -236,7 +239,8 @@ class Engine:
                         i = m.sensor(candidate.place.name).id
                         part = measures[1][:, s, m.sensor_adr[i]:m.sensor_adr[i] + m.sensor_dim[i]]
                     else:
-                        part = measures[0][:, s, np.flatnonzero(simple_q == m.joint(candidate.place.name).qposadr[0])[0]]
+                        column = list(simple_q).index(m.joint(candidate.place.name).qposadr[0])
+                        part = measures[0][:, s, column]
                     part[0], part[1], part[2] = part[0] + offset, part[1] * ratio, part[2] + delay
         return measures
 
@@ -258,6 +262,7 @@ def recorded_state(model, recording, t):
     row = int(np.argmin(abs(recording.time - t)))
     a, b, qvel = max(row - 1, 0), min(row + 1, len(recording.time) - 1), np.full(model.nv, np.nan)
     if b > a:
-        mujoco.mj_differentiatePos(model, qvel, recording.time[b] - recording.time[a], recording.qpos[a], recording.qpos[b])
+        seconds = recording.time[b] - recording.time[a]
+        mujoco.mj_differentiatePos(model, qvel, seconds, recording.qpos[a], recording.qpos[b])
     measured = getattr(recording, 'qvel', None)
     return recording.qpos[row], qvel if measured is None else np.where(np.isfinite(measured[row]), measured[row], qvel)

@@ -52,7 +52,8 @@ class JointNumber(JointEffect):
     def parameters(self, model, i):
         (name, *units), (field, k), M = self.number, self._field(model, i), self.scale(model, i)
         low = -HUGE * M if self.signed else 0.0
-        return Parameter(name, self.unit(model, i, *units), field[k], low, HUGE * M, max(self.step * M, 0.01 * abs(field[k]))),
+        step = max(self.step * M, 0.01 * abs(field[k]))
+        return Parameter(name, self.unit(model, i, *units), field[k], low, HUGE * M, step),
 
     def edit(self, model, i, values):
         field, k = self._field(model, i)
@@ -92,7 +93,8 @@ class QuadraticDamping(JointNumber):
 class CoulombFriction(JointNumber):
     """Dry friction, which holds the joint below its limit."""
     name, simplicity, related = 'coulomb_friction', 0, DISSIPATION
-    number, compiled, authored, step = ('frictionloss', 'N·m', 'N'), ('dof_frictionloss', None), ('frictionloss', None), 0.05
+    number, compiled, authored = ('frictionloss', 'N·m', 'N'), ('dof_frictionloss', None), ('frictionloss', None)
+    step = 0.05
 
     def edit(self, model, i, values):
         d = model.jnt_dofadr[i]

@@ -13,17 +13,19 @@ import numpy as np
 import surroundings  # noqa: F401, I001  (their effects join the catalogue, in this order)
 import joints        # noqa: F401
 import actuators     # noqa: F401
-from effects import EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, Place, angle, catalogue, constant_force, turns
+from effects import (EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, Place,  # noqa: F401  (EFFECTS to others)
+                     angle, catalogue, constant_force, turns)
 
 
 def explicit_inertia(spec, model):
     """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot be edited."""
     compiler, on = spec.compiler, mujoco.mjtInertiaFromGeom
-    implied = compiler.inertiafromgeom == on.mjINERTIAFROMGEOM_TRUE or compiler.settotalmass > 0  # even over what the file says
+    # even over what the file says
+    implied = compiler.inertiafromgeom == on.mjINERTIAFROMGEOM_TRUE or compiler.settotalmass > 0
     compiler.inertiafromgeom, compiler.settotalmass, compiler.balanceinertia = on.mjINERTIAFROMGEOM_AUTO, -1, False
     for body in spec.bodies[1:]:
-        if (implied or not body.explicitinertial or np.isfinite(body.fullinertia[0])) and model.body(body.name).mass[0] > 0:
-            i = model.body(body.name).id
+        i, explicit = model.body(body.name).id, body.explicitinertial and not np.isfinite(body.fullinertia[0])
+        if (implied or not explicit) and model.body_mass[i] > 0:
             body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
             body.mass, body.ipos, body.inertia = model.body_mass[i], model.body_ipos[i], model.body_inertia[i]
             body.ialt.type, body.iquat = mujoco.mjtOrientation.mjORIENTATION_QUAT, model.body_iquat[i]
@@ -40,7 +42,7 @@ class InertialEffect(Effect):
     def write(self, spec, model, i, values):
         explicit_inertia(spec, model)
         body = spec.body(model.body(i).name)
-        alone = SimpleNamespace(body_mass=np.array([body.mass]), body_ipos=np.array([body.ipos]), body_inertia=np.array([body.inertia]))
+        alone = SimpleNamespace(**{f'body_{f}': np.array([getattr(body, f)]) for f in ('mass', 'ipos', 'inertia')})
         self.edit(alone, 0, values)
         body.mass, body.ipos, body.inertia = alone.body_mass[0], alone.body_ipos[0], alone.body_inertia[0]
         return 'mjcf'
@@ -63,8 +65,8 @@ class Mass(InertialEffect):
 def turning(model, i):
     """Whether body i can rotate."""
     while i:
-        joints = model.jnt_type[model.body_jntadr[i]:model.body_jntadr[i] + model.body_jntnum[i]]
-        if (joints != SLIDE).any():
+        first = model.body_jntadr[i]
+        if (model.jnt_type[first:first + model.body_jntnum[i]] != SLIDE).any():
             return True
         i = model.body_parentid[i]
     return False
@@ -100,7 +102,8 @@ class Inertia(InertialEffect):
         return super().fits(model, i) and turning(model, i)
 
     def parameters(self, model, i):
-        return tuple(Parameter(n, 'kg·m²', I, 0.02 * I, 100 * I, 0.02 * I) for n, I in zip(('ixx', 'iyy', 'izz'), model.body_inertia[i]))
+        moments = zip(('ixx', 'iyy', 'izz'), model.body_inertia[i])
+        return tuple(Parameter(n, 'kg·m²', I, 0.02 * I, 100 * I, 0.02 * I) for n, I in moments)
 
     def edit(self, model, i, values):
         model.body_inertia[i] = values

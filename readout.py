@@ -44,7 +44,7 @@ def read(model, q, v, time, step, delay):
 
 
 def locate(x, length):
-    """Simulation, step and fraction of a step (0 within SLACK of a step) of times x (n, ...), in steps; all of x's shape."""
+    """Simulation, step and fraction of a step (0 within SLACK of a step), in x's shape, of times x (n, ...) in steps."""
     x = np.nan_to_num(x)
     k = np.clip(np.floor(x + SLACK).astype(int), 0, length - 1)
     fraction = np.where(abs(x - k) <= 1.5 * SLACK, 0.0, x - k)

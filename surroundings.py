@@ -84,7 +84,8 @@ def touchable(model, i):
     weld, parent = model.body_weldid[model.geom_bodyid], model.body_weldid[model.body_parentid]
     meets = ((model.geom_contype[i] & model.geom_conaffinity) | (model.geom_contype & model.geom_conaffinity[i])) != 0
     meets &= weld != weld[i]
-    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):  # parent and child pass through each other, but for the world
+    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+        # parent and child pass through each other, unless the parent is the world
         meets &= ~((weld != 0) & (weld[i] != 0) & ((parent[weld] == weld[i]) | (parent[weld[i]] == weld)))
     return meets & (not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT))
 
@@ -102,7 +103,7 @@ class ContactEffect(Effect):
 
     @staticmethod
     def partner(model, i):
-        """The geom this one mostly touches: a static one if any, else that with most friction; None if it can touch none."""
+        """The geom this one mostly touches, or None: a static one if any, else that with most friction."""
         meets = touchable(model, i)
         if not meets.any():
             return None
@@ -113,14 +114,14 @@ class ContactEffect(Effect):
     def pair(cls, model, i):
         """What geom i's contacts have nominally: condim, friction (3,), solref (2,), solimp (5,)."""
         j = cls.partner(model, i)
+        condim, friction, solref, solimp = (getattr(model, f'geom_{f}')[[i, j]] for f in ('condim', 'friction', 'solref', 'solimp'))
         if model.geom_priority[i] != model.geom_priority[j]:
-            k = max(i, j, key=lambda g: model.geom_priority[g])
-            return model.geom_condim[k], model.geom_friction[k].copy(), model.geom_solref[k].copy(), model.geom_solimp[k].copy()
-        a, b = model.geom_solmix[i], model.geom_solmix[j]
-        w = a / (a + b) if a + b > 1e-10 else 0.5
-        solref = [w * model.geom_solref[i] + (1 - w) * model.geom_solref[j], np.minimum(model.geom_solref[i], model.geom_solref[j])]
-        return (max(model.geom_condim[i], model.geom_condim[j]), np.maximum(model.geom_friction[i], model.geom_friction[j]),
-                solref[not (model.geom_solref[[i, j], 0] > 0).all()], w * model.geom_solimp[i] + (1 - w) * model.geom_solimp[j])
+            k = int(model.geom_priority[j] > model.geom_priority[i])
+            return condim[k], friction[k], solref[k], solimp[k]
+        mix = model.geom_solmix[[i, j]]
+        w = (mix / mix.sum() if mix.sum() > 1e-10 else np.full(2, 0.5))[:, None]
+        mixed = (w * solref).sum(axis=0) if (solref[:, 0] > 0).all() else solref.min(axis=0)
+        return condim.max(), friction.max(axis=0), mixed, (w * solimp).sum(axis=0)
 
     def edit(self, model, i, values):
         if model.geom_priority[i] <= model.geom_priority.min():

@@ -7,18 +7,19 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from actuators import nominal_delay
 from effects import runge_kutta
 from signals import Signal
 from surroundings import touchable
 
 COPY_BYTES = 50e6  # of edited models kept for the next call
-ROTATES = 1        # body_simple of a simple body with rotations; one that only slides is 2, and feels contacts differently if not simple
+ROTATES = 1        # body_simple of a simple body with rotations; one that only slides is 2
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
 
 class Drive(NamedTuple):
-    """What a simulation runs on: model (None if MuJoCo refused it), ctrl (count, nu), qfrc (nv,), xfrc (nbody, 6), the effects in it."""
+    """What a simulation runs on: ctrl (count, nu), qfrc (nv,), xfrc (nbody, 6); model None if MuJoCo refused it."""
     model: mujoco.MjModel
     ctrl: np.ndarray
     qfrc: np.ndarray
@@ -27,12 +28,16 @@ class Drive(NamedTuple):
 
 
 class Working:
-    """`model` for a set of candidates that need parts of their own; q, v: where in it the nominal model's coordinates are."""
+    """The model for a set of candidates that need parts of their own.
+
+    model; q, v: where in its qpos and qvel the nominal model's coordinates are.
+    """
 
     def __init__(self, spec, nominal, structure):
         spec, self.nominal = spec.copy(), nominal
         for body in spec.bodies[1:]:
-            if nominal.body(body.name).simple[0] == ROTATES:  # a simple body refuses a shifted centre of mass
+            # a simple body refuses a shifted centre of mass; one that only slides feels other contacts if not simple
+            if nominal.body(body.name).simple[0] == ROTATES:
                 body.simple = 0
         for actuator in spec.actuators:
             actuator.delay, actuator.nsample = 0, 0  # Signal delays the control instead
@@ -85,8 +90,10 @@ class Working:
             for candidate, values in items:
                 if candidate.effect.overrides('command'):
                     changed.setdefault(candidate.place.name, []).append((candidate.effect, values))
-                candidate.effect.push(qfrc, xfrc, self.model, candidate.effect.id(self.model, candidate.place.name), values)
-            memo[key] = self.edited(items, step), qfrc, xfrc, {name: tuple(effects) for name, effects in changed.items()}
+                i = candidate.effect.id(self.model, candidate.place.name)
+                candidate.effect.push(qfrc, xfrc, self.model, i, values)
+            changed = {name: tuple(effects) for name, effects in changed.items()}
+            memo[key] = self.edited(items, step), qfrc, xfrc, changed
         model, qfrc, xfrc, changed = memo[key]
         m, average = self.nominal, runge_kutta(self.nominal)
         key = id(recording), start
@@ -115,7 +122,7 @@ class Working:
         value, m = recording.ctrl[:, u], self.nominal
         if m.actuator_ctrllimited[a] and m.actuator_ctrlnum[a] == 1:
             value = np.clip(value, *m.actuator_ctrlrange[a])
-        return Signal(recording.time, value, max(m.actuator_delay[a], m.opt.timestep) if m.actuator_delay[a] > 0 else 0.0)
+        return Signal(recording.time, value, nominal_delay(m, a))
 
     def activation(self, recording, start):
         """Activations (na,) at time `start`, run on from the recorded control."""

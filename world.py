@@ -41,14 +41,19 @@ class World:
         self.title, self.spec = title, spec.copy()
         with quiet():
             self.spec.compile()
-            for elements in (self.spec.joints, self.spec.actuators, self.spec.bodies[1:], self.spec.geoms, self.spec.sensors):
+            s = self.spec
+            for elements in (s.joints, s.actuators, s.bodies[1:], s.geoms, s.sensors):
                 taken = {e.name for e in elements}
                 for element in elements:
                     if not element.name:
-                        element.name = next(n for n in (f'{prefix}{element.id}' for prefix in ('', 'index ')) if n not in taken)
+                        index = str(element.id)
+                        element.name = f'index {index}' if index in taken else index
             self.model = self.spec.compile()
-        self.candidates = [Candidate(effect, Place(effect.kind, name), tuple(effect.parameters(self.model, effect.id(self.model, name))))
-                           for effect in EFFECTS for name in effect.places(self.model)]
+        self.candidates = []
+        for effect in EFFECTS:
+            for name in effect.places(self.model):
+                parameters = effect.parameters(self.model, effect.id(self.model, name))
+                self.candidates.append(Candidate(effect, Place(effect.kind, name), tuple(parameters)))
         self._engines = {}
 
     @classmethod
@@ -102,8 +107,13 @@ class World:
 
     def related(self, candidate):
         """Candidates at the same joints in whose wrong nominal values this one may hide."""
-        return [c for c in self.candidates if c.effect.name in candidate.effect.related and c.effect.name != candidate.effect.name
-                and (self._joints(c.place) is None or self._joints(candidate.place) is None or self._joints(c.place) & self._joints(candidate.place))]
+        mine, out = self._joints(candidate.place), []
+        for other in self.candidates:
+            theirs = self._joints(other.place)
+            if other.effect.name in candidate.effect.related and other.effect.name != candidate.effect.name:
+                if mine is None or theirs is None or mine & theirs:
+                    out.append(other)
+        return out
 
     def _joints(self, place):
         """Ids of the joints a place belongs to, or None for all."""
@@ -150,14 +160,15 @@ class World:
                 if structure not in self._engines:
                     self._engines[structure] = Engine(self.spec, self.model, structure)
                 engine = self._engines[structure]
-                duration = max(w.recording.time[w.last] - w.recording.time[w.first] for w in (windows[s] for s, _ in members))
+                duration = max(r.time[last] - r.time[first] for r, first, last in (windows[s] for s, _ in members))
                 count = max(1, int(np.ceil(duration / step - SLACK)))
                 width = self.model.nu + engine.model.nq + engine.model.nv + sensors * self.model.nsensordata
                 chunk = int(np.clip(CHUNK_BYTES / (8 * count * width), 1, 1024))
                 for k in range(0, len(members), chunk):
                     ids, chosen = zip(*members[k:k + chunk])
                     ids = list(ids)
-                    run = engine.run(chosen, start_qpos[ids], start_qvel[ids], [windows[s] for s in ids], rows, step, count, sensors)
+                    some = [windows[s] for s in ids]
+                    run = engine.run(chosen, start_qpos[ids], start_qvel[ids], some, rows, step, count, sensors)
                     for whole, part in zip(out, run):
                         whole[ids] = part
         return tuple(out) if sensors else tuple(out[:2])
@@ -190,7 +201,8 @@ class Case:
     def __init__(self, model, setting, refine):
         order = {effect: k for k, effect in enumerate(EFFECTS)}
         items = [(c, tuple(float(v) for v in values)) for c, values in setting.items()]
-        self.on = sorted(((c, v) for c, v in items if v != c.nominal), key=lambda item: order.get(item[0].effect, len(order)))
+        items = [(c, v) for c, v in items if v != c.nominal]
+        self.on = sorted(items, key=lambda item: order.get(item[0].effect, len(order)))
         self.off = [(c, v) for c, v in self.on if not c.when]
         conditions = [c.when for c, _ in self.on if c.when]
         if any(when != conditions[0] for when in conditions):
