@@ -20,6 +20,11 @@ class JointEffect(Effect):
         return model.jnt_type[i] in (HINGE, SLIDE)
 
     @staticmethod
+    def driven(model, i):
+        """Whether an actuator acts on the joint itself."""
+        return ((model.actuator_trntype == JOINT_TRANSMISSION) & (model.actuator_trnid[:, 0] == i)).any()
+
+    @staticmethod
     def unit(model, i, hinge, slide):
         return hinge if turns(model, i) else slide
 
@@ -197,16 +202,23 @@ class Cogging(JointEffect):
     """Force amplitude·sin(poles·q + phase), as of a motor's magnets."""
     name, simplicity = 'cogging', 3
 
+    def fits(self, model, i):
+        return super().fits(model, i) and self.driven(model, i)
+
     def parameters(self, model, i):
         M = self.scale(model, i)
         return (Parameter('amplitude', self.unit(model, i, 'N·m', 'N'), 0.0, -HUGE * M, HUGE * M, 0.05 * M),
-                Parameter('poles', self.unit(model, i, '1', 'rad/m'), 6.0, 0.1, 1e5, 0.1),
+                Parameter('poles', self.unit(model, i, '1', 'rad/m'), 6.0, 0.1, 1e6, 0.1),
                 Parameter('phase', 'rad', 0.0, -10.0, 10.0, 0.1))
 
     def probes(self, model, i, recordings):
+        """Ripples close enough to each other for one of them to stay in step over the whole travel."""
         position, _ = self.travel(model, i, recordings)
-        base = 1.0 if turns(model, i) else 2 * np.pi / max(np.ptp(position), 1e-3)
-        poles = base * np.array([2, 3, 4, 6, 8, 12, 16, 24, 36])
+        travel = np.ptp(np.quantile(position, [0.05, 0.95])) + 1e-6
+        if turns(model, i) and travel > 5:
+            poles = np.arange(1, 25)
+        else:
+            poles = np.arange(2.0, 23.0, 1.5) / travel
         return np.array([(0.05 * self.scale(model, i), n, phase) for n in poles for phase in (0.0, np.pi / 2)])
 
     def _motor(self, model, i):
@@ -265,8 +277,7 @@ class Backlash(JointEffect):
     def fits(self, model, i):
         body = model.jnt_bodyid[i]
         last = model.body_jntadr[body] + model.body_jntnum[body] - 1 == i
-        driven = ((model.actuator_trntype == JOINT_TRANSMISSION) & (model.actuator_trnid[:, 0] == i)).any()
-        return super().fits(model, i) and last and driven
+        return super().fits(model, i) and last and self.driven(model, i)
 
     def parameters(self, model, i):
         return Parameter('gap', self.unit(model, i, 'rad', 'm'), 0.0, 0.0, 1.0, 0.005),
