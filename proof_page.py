@@ -40,7 +40,7 @@ def parse(row):
             "findings": json.loads(row["findings"] or "[]"), "parameters": json.loads(row["parameters"] or "[]"),
             "found": int(row["found"] or 0), "first": int(row["first"] or 0), "extras": int(row["extras"] or 0),
             "finer": int(row["finer"]), "sealed": seal(row["answer"], row["salt"]) == row["commitment"],
-            **{key: number(key) for key in ("seconds", "error_before", "error_after", "error_floor",
+            **{key: number(key) for key in ("seconds", "cpu_seconds", "error_before", "error_after", "error_floor",
                                             "reported_before", "reported_after")}}
 
 
@@ -214,7 +214,7 @@ def write(table, out):
     """Write the page of a table (rows as prove.read gives them) to `out`, whole."""
     rows = [parse(row) for row in table]
     kinds = Counter(row["kind"] for row in rows)
-    seconds = np.array([row["seconds"] for row in rows])
+    seconds = np.array([row["cpu_seconds"] for row in rows])
     worst = [(r["trial"], r["mechanism"], "finer" if r["finer"] > 1 else "same",
               "; ".join(f"{h['effect']}@{h['place']['name']} ({m:.1f}x)" for h, m in zip(r["hidden"], r["moved"])),
               "; ".join(f"{f['effect']}@{f['place']['name']}" for f in r["findings"]) or ("-" if r["exit"] == "0" else r["note"]))
@@ -223,7 +223,7 @@ def write(table, out):
         "<h1>Sealed blind trials of the diagnosis</h1>",
         f"<p>{len(rows)} trials, seed {', '.join(sorted({row['seed'] for row in rows}))}: "
         + ", ".join(f"{n} {kind}" for kind, n in kinds.items())
-        + f". Seconds for a diagnosis: median {np.median(seconds):.1f}, longest {seconds.max():.1f}.</p>",
+        + f". CPU seconds of a diagnosis: median {np.median(seconds):.1f}, longest {seconds.max():.1f}.</p>",
         _table(("rate", "hits / trials", "", "95 % Wilson interval"), lines(rows)),
         "<h2>Detection against size</h2>", _detection_figure(rows),
         "<h2>What was hidden, what was said first</h2>", _confusion_figure(rows),

@@ -20,6 +20,7 @@ import json
 from multiprocessing import Queue
 import os
 from pathlib import Path
+import resource
 import subprocess
 import sys
 import tempfile
@@ -36,7 +37,7 @@ from mechanisms import MECHANISMS, UNKNOWNS
 ROOT = Path(__file__).resolve().parent
 HORIZON = 0.3                                        # s
 COLUMNS = ("seed", "trial", "commitment", "salt", "answer", "kind", "mechanism", "noise", "finer",
-           "over_noise", "exit", "seconds", "verdict", "findings", "found", "first", "extras",
+           "over_noise", "exit", "seconds", "cpu_seconds", "verdict", "findings", "found", "first", "extras",
            "parameters", "error_before", "error_after", "error_floor", "reported_before",
            "reported_after", "note")
 PARAMETERS = {"mass": ("mass",), "center_of_mass": ("x", "y", "z"), "inertia": ("ixx", "iyy", "izz"),
@@ -150,16 +151,21 @@ def over_noise(answer, runs, without):
 # the diagnosis, as a user would run it
 
 def diagnose(command, folder, limit=900):
-    """Run diagnose.py in `folder` with a bare environment. Returns exit status, seconds, stderr's last line."""
+    """Run diagnose.py in `folder` with a bare environment.
+
+    Returns the columns exit, seconds (of the clock), cpu_seconds and note (stderr's last line).
+    """
     environment = {"PATH": os.defpath, "HOME": str(folder), "OMP_NUM_THREADS": "1"}
-    begun = time.monotonic()
+    begun, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     try:
         done = subprocess.run([sys.executable, str(ROOT / "diagnose.py"), *command, "--out", "report"], cwd=folder,
                               env=environment, capture_output=True, text=True, timeout=limit, stdin=subprocess.DEVNULL)
         status, note = done.returncode, (done.stderr.strip().splitlines() or [""])[-1]
     except subprocess.TimeoutExpired:
         status, note = 124, f"no diagnosis in {limit} s"
-    return status, time.monotonic() - begun, note[:300]
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {"exit": status, "seconds": time.monotonic() - begun, "note": note[:300],
+            "cpu_seconds": after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime}
 
 
 # scoring
@@ -224,12 +230,11 @@ def run_trial(seed, number, sealed):
         trial = conceal(seed, number, folder)
         with open(sealed, "a") as file:
             file.write(f"{seed} {number} {trial.commitment}\n")
-        status, seconds, note = diagnose(trial.command, folder)
-        return reveal(trial, folder / "report", seed, number, status, seconds, note)
+        return reveal(trial, folder / "report", seed, number, diagnose(trial.command, folder))
 
 
-def reveal(trial, report, seed, number, status, seconds, note):
-    """Check the seal, score the report against the answer. Returns the row."""
+def reveal(trial, report, seed, number, done):
+    """Check the seal, score the report against the answer. done: what `diagnose` returned. Returns the row."""
     if seal(trial.answer, trial.salt) != trial.commitment:
         raise ValueError(f"trial {number} of seed {seed}: the answer is not the one that was sealed")
     answer = json.loads(trial.answer)
@@ -241,11 +246,11 @@ def reveal(trial, report, seed, number, status, seconds, note):
     row = {"seed": seed, "trial": number, "commitment": trial.commitment, "salt": trial.salt,
            "answer": trial.answer, "kind": answer["kind"], "mechanism": answer["mechanism"],
            "noise": answer["noise"], "finer": answer["finer"], "over_noise": json.dumps([round(m, 4) for m in moved]),
-           "exit": status, "seconds": round(seconds, 2), "note": note,
+           **done,
            "error_before": stock_error(nominal, nominal, held_out, answer["noise"]),
            "error_floor": hand_error(Real(MECHANISMS[answer["mechanism"]], answer["hidden"], answer["finer"]),
                                      held_out, answer["noise"], False)}
-    if status == 0:
+    if done["exit"] == 0:
         summary = json.loads((report / "diagnosis.json").read_text())
         findings = summary["findings"]
         corrected = mujoco.MjModel.from_xml_path(str(report / "corrected.xml"))

@@ -266,7 +266,7 @@ def test_a_changed_answer_fails_its_commitment(tmp_path):
     assert conceal.seal(trial.answer, trial.salt) == trial.commitment
     trial.answer = trial.answer.replace('"null"', '"single"')
     with pytest.raises(ValueError, match="not the one that was sealed"):
-        prove.reveal(trial, tmp_path, 1, 20, 0, 0.0, "")
+        prove.reveal(trial, tmp_path, 1, 20, {"exit": 0})
 
 
 def test_the_diagnosing_process_gets_nothing_but_the_folder(tmp_path, monkeypatch):
@@ -280,8 +280,7 @@ def test_the_diagnosing_process_gets_nothing_but_the_folder(tmp_path, monkeypatc
     bench = tmp_path / "parent" / "bench"
     bench.mkdir(parents=True)
     trial = conceal.conceal(971, 35, bench)
-    status, _, _ = prove.diagnose(trial.command, bench)
-    assert status == 0
+    assert prove.diagnose(trial.command, bench)["exit"] == 0
     arguments, environment, folder, beside, files = json.loads((bench / "seen.json").read_text())
     assert Path(folder) == bench and beside == ["bench"]
     assert set(environment) <= {"PATH", "HOME", "OMP_NUM_THREADS", "LC_CTYPE"}
@@ -389,7 +388,7 @@ def test_run_resumes_and_the_page_is_whole(tmp_path, monkeypatch):
         row = dict.fromkeys(prove.COLUMNS, "")
         return row | {"seed": seed, "trial": number, "answer": truth, "salt": "ab", "commitment": conceal.seal(truth, "ab"),
                       "kind": "null", "mechanism": "arm2", "finer": 1, "over_noise": "[]", "exit": 0, "findings": "[]",
-                      "found": 0, "first": 0, "extras": 0, "seconds": 1.0, "parameters": "[]", "error_before": 2.0,
+                      "found": 0, "first": 0, "extras": 0, "seconds": 1.0, "cpu_seconds": 1.0, "parameters": "[]", "error_before": 2.0,
                       "error_after": 2.0, "error_floor": 2.0, "reported_before": 2.0, "reported_after": 2.0}
 
     monkeypatch.setattr(prove, "run_trial", fake)
