@@ -142,8 +142,8 @@ def windows_for(world, recordings, span, steps, event=None):
     every = []
     for r in recordings:
         sample = np.median(np.diff(r.time))
-        every += cut.consecutive(r, max(span, LEAST_ROWS * sample))
-    every = events.without(every, event) if event else every
+        for first, end in events.quiet(r, event):
+            every += cut.consecutive(r, max(span, LEAST_ROWS * sample), first, end)
     duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
     number = max(LEAST_WINDOWS, int(steps / dear(world.model) * world.model.opt.timestep / duration))
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]
@@ -230,7 +230,7 @@ def anything_left(data, search, hypothesis):
 
 
 def intervals(search, fit):
-    """{candidate: [(low, high), ...]}: 95 %, from the spread between clusters of windows."""
+    """{candidate: [(low, high), ...]}: 95 %, from the spread between clusters of windows, and the time step's error."""
     if not fit.hypothesis.effects:
         return {}
     slope, moves = search.slopes(fit)
@@ -240,6 +240,11 @@ def intervals(search, fit):
     covariance = scores.sandwich(gram[:, seen][:, :, seen], score[:, seen], np.zeros(seen.sum()))
     half = np.full(len(moves), np.inf)
     half[seen] = scores.t_quantile(max(len(gram) - seen.sum(), 1)) * np.sqrt(np.diag(covariance)) * np.abs(moves[seen])
+    # the integrator's own error: how far the values would move with half the time step
+    finer = search.problem.refined(fit)
+    shift = scores.solve_small(gram.sum(0)[np.ix_(seen, seen)], shooting.project(
+        search.problem, finer, slope, search.pieces).score.sum(0)[seen] - score.sum(0)[seen])
+    half[seen] = np.hypot(half[seen], shift * moves[seen])
     out, at = {}, 0
     for c, values in fit.hypothesis.effects:
         out[c] = [(max(v - h, p.low), min(v + h, p.high)) for v, h, p in zip(values, half[at:], c.parameters)]

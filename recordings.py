@@ -81,8 +81,9 @@ def _recording(path, name, columns, model, first_row):
     if back.any():
         row = int(np.argmax(back)) + 1
         word = "repeats" if time[row] == time[row - 1] else "runs backward from"
-        raise RecordingError(f"{path}: row {row + first_row}, column 'time': {time[row]:.9g} {word} {time[row - 1]:.9g}; "
-                             "remove repeated rows, sort them, and put separate runs into separate files")
+        do = ("write time with more digits" if word == "repeats" and back.mean() > 0.2 and np.ptp(time) > 0 else
+              "remove repeated rows, sort them, and put separate runs into separate files")
+        raise RecordingError(f"{path}: row {row + first_row}, column 'time': {time[row]:.9g} {word} {time[row - 1]:.9g}; {do}")
     arrays = {"qpos": np.full((len(time), model.nq), np.nan), "qvel": np.full((len(time), model.nv), np.nan),
               "ctrl": np.zeros((len(time), model.nu))}
     sensors = {}
@@ -99,7 +100,7 @@ def _recording(path, name, columns, model, first_row):
     if model.nq and np.isnan(arrays["qpos"]).all():
         raise RecordingError(f"{path}: no position is measured, every qpos is nan; at least one joint is needed")
     _quaternions(path, arrays["qpos"], model, first_row)
-    return Recording(name, time, sensors=sensors, **arrays)
+    return Recording(name.encode("utf-8", "replace").decode(), time, sensors=sensors, **arrays)  # a name can hold any byte
 
 
 def _quaternions(path, qpos, model, first_row):
@@ -185,6 +186,10 @@ def _check_time(recording, model, warn):
     if usual < 1e-6 or usual < model.opt.timestep / 500:
         raise RecordingError(f"{where}: rows stand {usual:.3g} s apart against a time step of {model.opt.timestep:g} s; "
                              "write seconds")
+    row = int(np.argmin(steps))
+    if steps[row] < 1e-4 * usual:
+        raise RecordingError(f"{where}: data row {row + 2} stands {steps[row]:.3g} s after the one before (others {usual:.3g} s); "
+                             "no velocity can be formed from these two, remove one")
     row = int(np.argmax(steps))
     if steps[row] > max(20 * usual, 0.1):
         raise RecordingError(f"{where}: gap of {steps[row]:.3g} s after data row {row + 1}, at {recording.time[row]:.6g} s (rows are {usual:.3g} s apart); "

@@ -63,12 +63,12 @@ class RealModel:
 
     @torch.no_grad()
     def __call__(self, s, a):
-        """f_psi(s, a) (N, nobs) float32, s being the sim's present observations."""
+        """f_psi(s, a) and the guess of it, both (N, nobs) float32, s being the sim's present observations."""
         s, a = np.asarray(s, np.float32), np.asarray(a, np.float32)
         guess = self.sim.peek(a).astype(np.float32) if self.residual else s
         predicted = self.net(*(torch.from_numpy(x) for x in (s, a, guess))).numpy()
         # a state that the observation does not show in full was never fitted: there the sim's word stands
-        return np.where(measured(self.sim, s)[:, None], predicted, guess) if self.residual else predicted
+        return (np.where(measured(self.sim, s)[:, None], predicted, guess) if self.residual else predicted), guess
 
 
 def measured(sim, s):
@@ -111,7 +111,8 @@ class ActionTransformerEnv(VectorEnv):
     The agent is g_phi: it observes (s, a), a ~ pi_theta(s), chooses delta_a, and is paid
     R_AT = -||f_psi(s, a) - s'||^2. The target policy and the sim are its environment. R_AT is never positive,
     so an agent that could end episodes would learn to: the task's falls are handed out as truncations, which
-    TRPO bootstraps like time limits.
+    TRPO bootstraps like time limits. Where f_psi starts from the sim's own guess of s', the reward is counted
+    from what a itself would have got, -||f_psi(s, a) - guess||^2: a baseline that g_phi does not influence.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -138,9 +139,11 @@ class ActionTransformerEnv(VectorEnv):
 
     def step(self, output):
         s, a = np.split(self.sa, [self.sim.single_observation_space.shape[0]], axis=1)
-        predicted = self.real_model(s, a)
+        predicted, guess = self.real_model(s, a)
         obs, _, terminated, truncated, info = self.sim.step(a, applied=self.transformer.apply(a, output))
         reward = -((predicted - info["next_obs"]) ** 2).sum(axis=1)
+        if self.real_model.residual:
+            reward += ((predicted - guess) ** 2).sum(axis=1)
         next_sa = self._with_action(info["next_obs"])
         done = terminated | truncated
         self.sa = next_sa.copy()
@@ -157,7 +160,7 @@ class GroundingSettings:
     """What the grounding methods can be told; defaults are the paper's where it gives them."""
 
     at: TRPOConfig = AT_CONFIG  # rgat: TRPO for the action transformer
-    at_std: float = 0.03  # rgat: its initial standard deviation, in units of the action range
+    at_std: float = 0.005  # rgat: its initial standard deviation, in units of the action range
     residual: bool = True  # rgat and gat: f_psi corrects the sim's own prediction
     smoothing: float = 0.95  # gat: a_hat = smoothing * g(s, a) + (1 - smoothing) * a
     ane_width: float = 0.2  # ane: standard deviation of the action noise, in units of half the action range
@@ -213,6 +216,9 @@ class RGAT(Grounding):
             sa = torch.from_numpy(np.concatenate((self.seen.s, self.seen.a), axis=1))
             for network in (self.learner.policy, self.learner.value):
                 network.normalizer.update(sa)
+        # exploration is renewed: with what TRPO leaves of it, a trust region would hold g_phi where it is
+        with torch.no_grad():
+            self.learner.policy.log_std.fill_(np.log(self.settings.at_std))
         env = ActionTransformerEnv(self.sim, self.transformer, policy, self.real_model, seed)
         kls = []
         self.learner.learn(env, steps, seed, on_update=lambda stats: (kls.append(stats["kl"]), on_update and on_update(stats)))
@@ -261,7 +267,7 @@ class GAT(Grounding):
 
     @torch.no_grad()
     def _transform(self, obs, action):
-        s_next = torch.from_numpy(self.real_model(obs, action))
+        s_next = torch.from_numpy(self.real_model(obs, action)[0])
         a_hat = self.inverse_model(torch.from_numpy(obs.astype(np.float32)), s_next).numpy()
         smoothing = self.settings.smoothing
         return np.clip(smoothing * a_hat + (1 - smoothing) * action, self.low, self.high)

@@ -302,12 +302,21 @@ class Search:
             if 1 - fits[i].chi2.sum() / before < 0.5 * worth * len(added):
                 continue
             [new] = shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4)
-            if 1 - new.chi2.sum() / fit.chi2.sum() < worth * len(added):
+            if 1 - new.chi2.sum() / fit.chi2.sum() < worth * len(added) or not self.shared(fit, new, worth):
                 continue
             p = max(self.significance(new, c)[0] for c in added)
             if p < level:
                 return new, added, p
         return None
+
+    def shared(self, fit, new, worth):
+        """Whether more than one recording gains, where there are several: what one run alone shows is no lasting effect."""
+        owners = [id(w.recording) for w in self.problem.windows]
+        before, after = ({o: f.chi2[[i for i, p in enumerate(owners) if p == o]].sum() for o in owners} for f in (fit, new))
+        if len(before) < 3:
+            return True
+        best = max(before, key=lambda o: before[o] - after[o])
+        return sum(after[o] for o in after if o != best) < (1 - 0.3 * worth) * sum(before[o] for o in before if o != best)
 
     def drop(self, fit, added):
         """Leave out earlier effects that no longer earn their keep."""

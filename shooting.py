@@ -109,10 +109,16 @@ class Problem:
         out.rows = int(out.weight.astype(bool).sum())
         return out
 
-    def residuals(self, settings, which, qpos, qvel):
+    def refined(self, fit):
+        """The same fit with its residual as half the time step would give it."""
+        every = np.arange(len(self.windows))
+        residual = self.residuals([fit.hypothesis.settings] * len(every), every, fit.qpos, fit.qvel, refine=2)
+        return Fit(fit.hypothesis, fit.qpos, fit.qvel, residual, fit.start_jacobian)
+
+    def residuals(self, settings, which, qpos, qvel, refine=1):
         """(S, m): S simulations, the i-th in window which[i] under settings[i] from (qpos[i], qvel[i])."""
         which = np.asarray(which)
-        predicted_qpos, predicted_qvel = self.world.simulate(settings, qpos, qvel, [self.windows[i] for i in which])
+        predicted_qpos, predicted_qvel = self.world.simulate(settings, qpos, qvel, [self.windows[i] for i in which], refine)
         short = ((0, 0), (0, self.weight.shape[1] - predicted_qpos.shape[1]), (0, 0))  # these may be the shorter windows
         predicted_qpos, predicted_qvel = np.pad(predicted_qpos, short), np.pad(predicted_qvel, short)
         with np.errstate(invalid="ignore", over="ignore"):

@@ -129,23 +129,21 @@ def states(model, recording):
     return qpos, np.where(np.isfinite(qvel), qvel, central)
 
 
-def consecutive(recording, horizon=HORIZON):
+def consecutive(recording, horizon=HORIZON, first=0, end=None):
     """Windows of horizon seconds end to end (one's last row is the next one's first); an incomplete last one is dropped.
 
-    A recording shorter than the horizon is one window.
+    first, end: rows of the stretch to cut, end not included. A stretch shorter than the horizon is one window.
     """
-    time, out, first = recording.time, [], 0
-    sample = np.median(np.diff(time))
-    while True:
+    time, out = recording.time[:end], []
+    sample, start = np.median(np.diff(recording.time)), first
+    while first < len(time) - 1:
         last = int(np.searchsorted(time, time[first] + horizon + 0.01 * sample, side="right")) - 1
         last = max(last, first + 1)
-        if last >= len(time) or time[-1] < time[first] + horizon - 0.5 * sample:
+        if time[-1] < time[first] + horizon - 0.5 * sample:
             break
         out.append(Window(recording, first, last))
         first = last
-        if first >= len(time) - 1:
-            break
-    return out or [Window(recording, 0, len(time) - 1)]
+    return out or [Window(recording, start, len(time) - 1)]
 
 
 def recorded_starts(model, windows):

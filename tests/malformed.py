@@ -194,6 +194,8 @@ def cases():
 
     # time
     table("repeated time", "repeats", lambda x: x.__setitem__((50, 0), x[49, 0]))
+    table("almost repeated time", "remove one", lambda x: x.__setitem__((50, 0), x[49, 0] + 1e-8))
+    table("time with too few digits", "more digits", lambda x: x.__setitem__((slice(None), 0), np.round(x[:, 0], 1)))
     table("backward time", "backward", lambda x: x.__setitem__((50, 0), x[48, 0] + 0.001))
     table("two runs in one file", "backward", lambda x: np.vstack([x, x]))
     table("time reversed", "backward", lambda x: x[::-1])

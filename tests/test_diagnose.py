@@ -137,6 +137,22 @@ def test_the_function_reads_as_the_command_does(command):
     assert calls and all(0 <= share <= 1 and isinstance(what, str) for share, what in calls)
 
 
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_is_for_terminals(terminal, tmp_path, capsys, monkeypatch):
+    def stop(model, recordings, held_out, progress):
+        assert (progress is not None) == terminal
+        if progress:
+            progress(0.25, "estimating noise")
+            progress(0.5, "searching")
+        raise RecordingError("enough")
+    monkeypatch.setattr(diagnose, "diagnose", stop)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
+    argv = CASES["empty file"].write(tmp_path)
+    assert diagnose.main(argv) == 2
+    err = capsys.readouterr().err
+    assert err.endswith("diagnose.py: enough\n") and ("searching" in err and "50%" in err) == terminal
+
+
 # --- words ---
 
 def parameter(name, nominal, value, half, unit):

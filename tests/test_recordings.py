@@ -143,6 +143,13 @@ def test_files_of_one_name_are_told_apart(tmp_path, model, good):
     assert [r.name for r in load([tmp_path / "a/run.csv", tmp_path / "b/run.csv"], model)] == ["a/run.csv", "b/run.csv"]
 
 
+def test_a_name_of_any_bytes(tmp_path, model, good):
+    path = os.path.join(os.fsencode(tmp_path), b"run\xff.csv")
+    with open(path, "wb") as stream:
+        stream.write(text(good))
+    load(os.fsdecode(path), model)[0].name.encode("utf-8")  # a report can be written
+
+
 def test_two_hundred_thousand_rows_in_seconds(tmp_path, model):
     rows = 200_000
     table = np.column_stack([np.arange(rows) * 0.001, np.random.default_rng(0).normal(size=(rows, 6))])
