@@ -1,0 +1,138 @@
+"""Effects that act only for a while: a load picked up, a push. Where in time does the residual concentrate?
+
+    event = find(world, problem, fit)            # None, or an Event
+    event.when, event.candidate                  # {"recording": name, "time": [a, b]}, a localised Candidate
+
+Windows follow each other through every recording. The gain of an effect that acts in windows a..b only is the gain of
+the sums of its scores and Gram matrices over them, so every interval is tested from one simulation per effect.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import scores
+import shooting
+
+LEVEL = 1e-3  # false-alarm rate, shared between all intervals and effects
+CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the interval must explain
+LONGEST = 0.7  # of a recording: what lasts longer is no event
+
+
+@dataclass
+class Event:
+    candidate: object  # localised
+    values: tuple
+    recording: object
+    time: tuple  # (from, to), s
+    p_value: float
+    fit: object = None  # shooting.Fit on the windows around it
+    problem: object = None
+    others: list = field(default_factory=list)  # [(candidate, values)] that explain it as well
+
+    @property
+    def when(self):
+        return {"recording": self.recording.name, "time": [float(t) for t in self.time]}
+
+
+def tried(world):
+    """(the effect that acts always, the one to report) for every effect that may come and go."""
+    by = {(c.effect.name, c.place): c for c in world.candidates}
+    out = [(c, c) for c in world.candidates if c.effect.name == "external_force"]
+    return out + [(by["mass", c.place], c) for c in world.candidates if c.effect.timed and ("mass", c.place) in by]
+
+
+def find(world, problem, fit):
+    """The one interval and effect that explain most of a residual which is concentrated there, or None."""
+    pairs = tried(world)
+    if not pairs or len(problem.windows) < 12:
+        return None
+    settings, where, moves = [], [], []
+    for steady, _ in pairs:
+        moved, step = shooting.perturbed(shooting.Hypothesis(((steady, steady.nominal),)))
+        where.append(range(len(settings), len(settings) + len(step)))
+        settings += [{**fit.hypothesis.settings, steady: m[steady]} for m in moved]
+        moves.append(step)
+    scan = shooting.project(problem, fit, shooting.columns(problem, [fit], [settings])[0])
+    excess = (scan.chi2 - np.quantile(scan.chi2, 0.3)).clip(0).sum()
+    best, everything = None, []
+    recordings = list({id(w.recording): w.recording for w in problem.windows}.values())
+    for (steady, timed), columns, step in zip(pairs, where, moves):
+        keep = [c for c in columns if scan.gram[:, c, c].sum() > shooting.UNSEEN]
+        if not keep:
+            continue
+        score, gram = scan.score[:, keep], scan.gram[:, keep][:, :, keep]
+        alone = np.array([s @ scores.solve_small(g, s) for s, g in zip(score, gram)])
+        spread = max(np.quantile(alone, 0.3) / len(keep) * 2, 1.0)  # what windows without an event show
+        for r in recordings:
+            mine = np.array([i for i, w in enumerate(problem.windows) if w.recording is r])
+            for a in range(len(mine)):
+                for b in range(a, min(len(mine), a + max(1, int(LONGEST * len(mine))))):
+                    s, g = score[mine[a:b + 1]].sum(0), gram[mine[a:b + 1]].sum(0)
+                    value = scores.solve_small(g, s)
+                    gain = float(s @ value)
+                    if best is None or gain > best[0]:
+                        full = np.zeros(len(columns))
+                        full[[c - columns[0] for c in keep]] = value
+                        best = gain, timed, np.array(timed.nominal) + full * step, r, mine[a], mine[b], len(keep), spread
+        everything.append((timed, columns, keep, step, score, gram))
+    if best is None:
+        return None
+    gain, timed, values, r, a, b, k, spread = best
+    count = len(problem.windows)
+    p = scores.f_survival(gain / k / spread, k, max(count - k, 1)) * count**2 * len(pairs)
+    if p > LEVEL or gain < CONCENTRATED * excess:
+        return None
+    low, high = (np.array([getattr(q, f) for q in timed.parameters]) for f in ("low", "high"))
+    time = r.time[problem.windows[a].first], r.time[problem.windows[b].last]
+    event = refined(world, problem, fit, Event(None, tuple(np.clip(values, low, high)), r, time, float(min(p, 1))), timed)
+    inside, others = [i for i in range(a, b + 1) if problem.windows[i].recording is r], []
+    for other, columns, keep, step, score, gram in everything:
+        if other != timed:
+            s, g = score[inside].sum(0), gram[inside].sum(0)
+            value = scores.solve_small(g, s)
+            if s @ value > 0.8 * gain:
+                full = np.array(other.nominal)
+                full[[c - columns[0] for c in keep]] += value * step[[c - columns[0] for c in keep]]
+                others.append((world.localised(other, event.when), full))
+    rest = fit.hypothesis
+    fits = shooting.solve(event.problem, [rest.plus(c, v) for c, v in others], event.fit, iterations=4)
+    now = event.fit.chi2.sum()
+    close = sorted((f.chi2.sum(), i) for i, f in enumerate(fits) if f.chi2.sum() < 1.1 * now)
+    event.others = [(fits[i].hypothesis.candidates[-1], fits[i].hypothesis.effects[-1][1]) for _, i in close[:3]]
+    return event
+
+
+def refined(world, problem, fit, event, timed):
+    """The event with its ends moved, and its values fitted, on the windows around it."""
+    span = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in problem.windows])
+    near = [i for i, w in enumerate(problem.windows) if w.recording is event.recording
+            and w.recording.time[w.last] > event.time[0] - 2.5 * span and w.recording.time[w.first] < event.time[1] + 2.5 * span]
+    local, start = problem.subset(near), fit.subset(near)
+    bounds, values = list(event.time), event.values
+    sample = float(np.median(np.diff(event.recording.time)))
+    for reach in (span, span / 3, sample):
+        for end in (0, 1):
+            trials = []
+            for shift in np.linspace(-reach, reach, 7):
+                time = bounds.copy()
+                time[end] += shift
+                if time[1] - time[0] > sample:
+                    trials.append(time)
+            hypotheses = [fit.hypothesis.plus(world.localised(timed, {"recording": event.recording.name, "time": t}), values) for t in trials]
+            fits = shooting.solve(local, hypotheses, start, iterations=3)
+            best = int(np.argmin([f.chi2.sum() for f in fits]))
+            bounds, values = trials[best], fits[best].hypothesis.effects[-1][1]
+            start = fits[best]
+    event.candidate, event.values, event.time = start.hypothesis.candidates[-1], values, tuple(bounds)
+    event.fit, event.problem = start, local
+    return event
+
+
+def quiet(recording, event):
+    """[(first row, end row)] of the stretches of a recording that an event does not touch."""
+    rows = len(recording.time)
+    if event is None or recording is not event.recording:
+        return [(0, rows)]
+    start, stop = np.searchsorted(recording.time, event.time)
+    return [(a, b) for a, b in ((0, int(start)), (int(stop) + 1, rows)) if b - a > 8]
