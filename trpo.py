@@ -43,7 +43,7 @@ class TRPOConfig:
 
 
 PRESETS = {
-    "InvertedPendulum": TRPOConfig(batch_size=2048),
+    "InvertedPendulum": TRPOConfig(value_epochs=10),
     "Hopper": TRPOConfig(),
     "HalfCheetah": TRPOConfig(),
 }
