@@ -389,7 +389,8 @@ def test_run_resumes_and_the_page_is_whole(tmp_path, monkeypatch):
         return row | {"seed": seed, "trial": number, "answer": truth, "salt": "ab", "commitment": conceal.seal(truth, "ab"),
                       "kind": "null", "mechanism": "arm2", "finer": 1, "over_noise": "[]", "exit": 0, "findings": "[]",
                       "found": 0, "first": 0, "extras": 0, "seconds": 1.0, "cpu_seconds": 1.0, "parameters": "[]", "error_before": 2.0,
-                      "error_after": 2.0, "error_floor": 2.0, "reported_before": 2.0, "reported_after": 2.0}
+                      "error_after": 2.0, "error_floor": 2.0, "reported_before": 2.0, "reported_after": 2.0,
+                      "remeasured_after": 2.0}
 
     monkeypatch.setattr(prove, "run_trial", fake)
     monkeypatch.setattr(prove, "ProcessPoolExecutor", ThreadPoolExecutor)
@@ -418,6 +419,7 @@ def test_a_sealed_trial_scores_as_expected(tmp_path, number, expected):
     truth = json.loads(row["answer"])
     assert [item["effect"] for item in truth["hidden"]] == ([expected] if expected else [])
     assert conceal.seal(row["answer"], row["salt"]) == row["commitment"]
+    assert expected == "sensor_scale" or float(row["remeasured_after"]) == pytest.approx(float(row["reported_after"]), rel=0.02)
     assert (tmp_path / "sealed").read_text() == f"1 {number} {row['commitment']}\n"
     assert (row["found"], row["first"], row["extras"]) == ((1, 1, 0) if expected else (0, 0, 0))
     if expected:
