@@ -60,8 +60,9 @@ def split(recordings):
         cut = int(np.searchsorted(recording.time, recording.time[0] + 0.7 * np.ptp(recording.time)))
         for rows in (slice(None, cut), slice(cut, None)):
             if len(recording.time[rows]) < 10:
-                raise recorded.RecordingError(f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} rows; record "
-                                              f"again, longer ({recorded.ENOUGH}), or give --held-out")
+                raise recorded.RecordingError(
+                    f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} rows; record again, longer "
+                    f"({recorded.ENOUGH}), or give --held-out")
             parts.append(dataclasses.replace(
                 recording, time=recording.time[rows], qpos=recording.qpos[rows], qvel=recording.qvel[rows],
                 ctrl=recording.ctrl[rows], sensors={name: values[rows] for name, values in recording.sensors.items()}))
@@ -84,13 +85,15 @@ def _world(model):
         do = "correct the file" if make is World.load else "give the id of a gymnasium MuJoCo environment, or --model file.xml"
         raise ModelError(f"{what}: the model does not load ({error}); {do}") from None
     if world.model.nq == 0:
-        raise ModelError(f"{what}: the model has no joints, so nothing in it can move; give the model of the recorded mechanism")
+        raise ModelError(f"{what}: the model has no joints, so nothing in it can move; give the model of the recorded "
+                         "mechanism")
     return world
 
 
 def _recordings(recordings, held_out, model):
     """Both lists as Recording objects, with names that tell them apart, and none in both."""
-    given, more = ([x] if isinstance(x, (str, os.PathLike, recorded.Recording)) else list(x or []) for x in (recordings, held_out))
+    one = (str, os.PathLike, recorded.Recording)
+    given, more = ([x] if isinstance(x, one) else list(x or []) for x in (recordings, held_out))
     if not given:
         raise recorded.RecordingError("no recordings given: name at least one CSV or NPZ file")
     if any(isinstance(x, recorded.Recording) for x in given + more):
@@ -116,8 +119,8 @@ def _runs(model, recordings):
                 target[:] = np.where(np.isnan(known), target, known)
             end = data.time + 0.3
             while data.time < end:
-                now = min(np.searchsorted(recording.time, recording.time[row] + data.time, side="right") - 1, len(recording.time) - 1)
-                data.ctrl[:] = recording.ctrl[now]
+                now = recording.time[row] + data.time
+                data.ctrl[:] = recording.ctrl[np.searchsorted(recording.time, now, side="right") - 1]
                 mujoco.mj_step(model, data)
                 bad = [name for name in ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
                        if data.warning[getattr(mujoco.mjtWarning, name)].number]
@@ -127,8 +130,8 @@ def _runs(model, recordings):
                     break
             tried += 1
     if failed > tried / 2:
-        raise ModelError(f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first {example}); reduce its time "
-                         "step, or check its masses and gains, and the units of the recordings")
+        raise ModelError(f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first {example}); reduce its "
+                         "time step, or check its masses and gains, and the units of the recordings")
     return [f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first {example})"] if failed else []
 
 
@@ -160,17 +163,18 @@ def main(argv=None):
         with quiet():
             if sys.stderr.isatty():
                 bar = tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", file=sys.stderr)
-            diagnosis = diagnose(args.model or args.env, args.recordings, args.held_out, progress if bar is not None else None)
+            diagnosis = diagnose(args.model or args.env, args.recordings, args.held_out, bar and progress)
             report.write(diagnosis, args.out)
     except (recorded.RecordingError, ModelError, report.ReportError, mujoco.FatalError, MemoryError) as error:
-        if bar is not None:
+        if bar:
             bar.close()
-        print(f"diagnose.py: {error}" if str(error) else "diagnose.py: out of memory; give fewer or shorter recordings", file=sys.stderr)
+        message = str(error) or "out of memory; give fewer or shorter recordings"
+        print(f"diagnose.py: {message}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("\ndiagnose.py: stopped; nothing was written", file=sys.stderr)
         return 130
-    if bar is not None:
+    if bar:
         bar.close()
     print(wording.terminal(diagnosis.summary, args.out.rstrip("/")))
     return 0

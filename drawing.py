@@ -100,7 +100,7 @@ def marked(model, place):
         joint = _id(model.joint, name)
     elif kind == "actuator":
         actuator = _id(model.actuator, name)
-        if actuator is not None and mujoco.mjtTrn(model.actuator_trntype[actuator]) in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        if actuator is not None and model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
             joint = int(model.actuator_trnid[actuator, 0])
     elif kind == "sensor":
         sensor = _id(model.sensor, name)
@@ -110,7 +110,9 @@ def marked(model, place):
         geom = _id(model.geom, name)
         if geom is None:
             return [], None
-        return [geom], lambda data: _under(model, data, geom) if GEOM(model.geom_type[geom]) == GEOM.mjGEOM_PLANE else data.geom_xpos[geom]
+        if model.geom_type[geom] == GEOM.mjGEOM_PLANE:
+            return [geom], lambda data: _under(model, data, geom)
+        return [geom], lambda data: data.geom_xpos[geom]
     elif kind == "body":
         body = _id(model.body, name)
         if body is not None:
@@ -158,8 +160,12 @@ def mechanism(model, poses, places, labels, width=380, height=300):
     anchors = data.xanchor @ axes.T if model.njnt else np.zeros((0, 2))
     first = np.concatenate([points for _, points, _ in drawn[0]] + [anchors, data.xipos[1:] @ axes.T])
     size = np.ptp(first, axis=0).max()
-    ghosts = [ghost for ghost in drawn[1:] if ghost and np.ptp(np.concatenate([first] + [p for _, p, _ in ghost]), axis=0).max() < 3 * size]
-    paper = Paper(np.concatenate([first] + [p for ghost in ghosts for _, p, _ in ghost]), width, height, 40)
+    inside, ghosts = first, []  # the other poses, unless they are so far apart that the first would shrink to a dot
+    for ghost in drawn[1:]:
+        wider = np.concatenate([inside] + [points for _, points, _ in ghost])
+        if np.ptp(wider, axis=0).max() < 3 * size:
+            inside, ghosts = wider, [*ghosts, ghost]
+    paper = Paper(inside, width, height, 40)
     height = paper.height
     coloured, points = set(), []
     for place in places:
@@ -190,8 +196,10 @@ def mechanism(model, poses, places, labels, width=380, height=300):
         tx = min(x + 20, width - room - 4) if right else max(x - 20, room + 4)
         tx = max(4, tx) if right else min(width - 4, tx)
         if point is not None:
-            parts.append(f'<path class="leader" d="M{x + (8 if right else -8):.1f} {y - 8:.1f}L{tx - (3 if right else -3):.1f} {ty - 4:.1f}"/>')
-        parts.append(f'<text class="badlabel" x="{tx:.1f}" y="{ty:.1f}" text-anchor="{"start" if right else "end"}">{html.escape(label)}</text>')
+            side = 1 if right else -1
+            parts.append(f'<path class="leader" d="M{x + 8 * side:.1f} {y - 8:.1f}L{tx - 3 * side:.1f} {ty - 4:.1f}"/>')
+        anchor = "start" if right else "end"
+        parts.append(f'<text class="badlabel" x="{tx:.1f}" y="{ty:.1f}" text-anchor="{anchor}">{html.escape(label)}</text>')
     return "".join(parts) + "</svg>"
 
 
@@ -246,8 +254,8 @@ def _joint(model, data, j, axes, towards, paper):
         if length < 0.2:
             return ""
         dx, dy = 26 * direction / length
-        tips = "".join(f"M{x + s * dx:.1f} {y + s * dy:.1f}l{s * (-0.25 * dx - 0.15 * dy):.1f} {s * (-0.25 * dy + 0.15 * dx):.1f}"
-                       f"M{x + s * dx:.1f} {y + s * dy:.1f}l{s * (-0.25 * dx + 0.15 * dy):.1f} {s * (-0.25 * dy - 0.15 * dx):.1f}" for s in (1, -1))
+        tips = "".join(f"M{x + end * dx:.1f} {y + end * dy:.1f}l{-end * (0.25 * dx + side * 0.15 * dy):.1f} "
+                       f"{-end * (0.25 * dy - side * 0.15 * dx):.1f}" for end in (1, -1) for side in (1, -1))
         return f'<path class="slide" d="M{x - dx:.1f} {y - dy:.1f}L{x + dx:.1f} {y + dy:.1f}{tips}"/>'
     return ""
 

@@ -9,7 +9,8 @@ SEPARATING = [
     ({"viscous_damping", "back_emf"}, "back-drive the joint with the motor disconnected: damping of the joint stays, back-EMF goes"),
     ({"delay", "lag"}, "drive with a sine of rising frequency: a lag shrinks the response, a delay only shifts it"),
     ({"delay", "lag", "time_step"}, "simulate with a smaller time step: what then disappears was the simulator's own step"),
-    ({"coulomb_friction", "stribeck_friction"}, "reverse slowly many times, at a tenth of the usual speed: only Stribeck friction falls as motion starts"),
+    ({"coulomb_friction", "stribeck_friction"},
+     "reverse slowly many times, at a tenth of the usual speed: only Stribeck friction falls as motion starts"),
     ({"coulomb_friction", "dead_zone"}, "push the joint by hand with the actuator off: friction resists, a dead zone does not"),
     ({"coulomb_friction", "backlash"}, "reverse under a light preload in one direction: backlash goes, friction stays"),
     ({"coulomb_friction", "stribeck_friction", "viscous_damping", "quadratic_damping", "air_drag", "back_emf"},
@@ -31,6 +32,11 @@ SEPARATING = [
 OTHERWISE = "record larger and faster motion, and motion in which only one of the two places moves"
 
 
+def _way(one, other):
+    """The experiment that separates two effects; the same effect at two places needs motion of only one."""
+    return next((way for both, way in SEPARATING if one != other and {one, other} <= both), OTHERWISE)
+
+
 def advice(findings):
     """[sentence] for the findings (as in diagnosis.json) that list rivals in `also_possible`."""
     lines = []
@@ -38,8 +44,7 @@ def advice(findings):
         rivals = finding.get("also_possible") or []
         if not rivals:
             continue
-        ways = [next((way for both, way in SEPARATING if {finding["effect"], rival["effect"]} <= both and finding["effect"] != rival["effect"]), OTHERWISE)
-                for rival in rivals]
+        ways = [_way(finding["effect"], rival["effect"]) for rival in rivals]
         names = ", ".join(f"{effect_words(r['effect'])} of {place_words(r['place'])}" for r in rivals)
         what = f"{effect_words(finding['effect'])} of {place_words(finding['place'])}"
         lines.append(f"{what[:1].upper()}{what[1:]} or {names}: {'; '.join(dict.fromkeys(ways))}.")

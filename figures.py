@@ -114,9 +114,9 @@ def chart(series, x_label, y_label, width=380, height=230, log_y=False, zero=Fal
                     pen = "M"
             parts.append(f'<path class="{s.look} line" d="{"".join(d)}"/>')
     middle = (top + height - bottom) / 2
-    parts.append(f'<text class="axis" x="{(left + width - right) / 2}" y="{height - 8}" text-anchor="middle">{html.escape(x_label)}</text>'
-                 f'<text class="axis" x="12" y="{middle}" text-anchor="middle" transform="rotate(-90 12 {middle})">{html.escape(y_label)}</text>'
-                 "</svg>")
+    parts.append(f'<text class="axis" x="{(left + width - right) / 2}" y="{height - 8}" text-anchor="middle">'
+                 f'{html.escape(x_label)}</text><text class="axis" x="12" y="{middle}" text-anchor="middle" '
+                 f'transform="rotate(-90 12 {middle})">{html.escape(y_label)}</text></svg>')
     return "".join(parts)
 
 
@@ -155,8 +155,9 @@ def whisker(parameter, width=220, height=34):
     parts = [f'<svg viewBox="0 0 {width} {height}" class="whisker" role="img" aria-label="nominal {wording.number(nominal)}, '
              f'estimate {wording.number(value)}"><path class="grid" d="M6 12H{width - 6}"/>']
     if nominal is not None:
-        parts.append(f'<path class="nominal tickmark" d="M{px(nominal):.1f} 5V19"/><text class="tick" x="{min(max(px(nominal), 24), width - 24):.1f}" '
-                     f'y="31" text-anchor="middle">{wording.number(nominal)}</text>')
+        x = min(max(px(nominal), 24), width - 24)
+        parts.append(f'<path class="nominal tickmark" d="M{px(nominal):.1f} 5V19"/>'
+                     f'<text class="tick" x="{x:.1f}" y="31" text-anchor="middle">{wording.number(nominal)}</text>')
     if low is not None and high is not None:
         parts.append(f'<path class="corrected whisk" d="M{px(low):.1f} 12H{px(high):.1f}"/>')
     parts.append(f'<circle class="corrected point" cx="{px(value):.1f}" cy="12" r="4.5"/></svg>')

@@ -129,7 +129,8 @@ def _unknown(name, known, model):
         meant = meant or (f"; it has {', '.join(options[:6])}{', ...' if len(options) > 6 else ''}" if options
                           else f"; it has no {what}s: remove the column")
         return f"the model has no {what} {place!r}{meant}"
-    return f"not a column of a recording{meant or '; columns are time, qpos:<joint>, qvel:<joint>, ctrl:<actuator>, sensor:<name>'}"
+    return "not a column of a recording" + (meant or "; columns are time, qpos:<joint>, qvel:<joint>, ctrl:<actuator>, "
+                                            "sensor:<name>")
 
 
 # --- CSV ------------------------------------------------------------------------------------------------------------
@@ -180,8 +181,10 @@ def _slow(path, body, names):
             raise RecordingError(f"{path}: row {row}: an empty line inside the recording; remove it")
         cells = [cell.strip().strip('"') for cell in line.split(",")]
         if len(cells) != len(names):
-            why = " (is the file cut off?)" if row == len(lines) + 1 else " (is a decimal comma used?)" * (len(cells) > len(names))
-            raise RecordingError(f"{path}: row {row}: {len(cells)} cells where the header has {len(names)}; repair the row{why}")
+            why = (" (is the file cut off?)" if row == len(lines) + 1 else
+                   " (is a decimal comma used?)" if len(cells) > len(names) else "")
+            raise RecordingError(f"{path}: row {row}: {len(cells)} cells where the header has {len(names)}; repair the "
+                                 f"row{why}")
         values = [float("nan") if cell == "" else _number(cell) for cell in cells]
         if None in values:
             k = values.index(None)
@@ -225,7 +228,8 @@ def _npz(path, data, model):
         raise
     except (ValueError, OSError, EOFError, KeyError, MemoryError, RuntimeError, NotImplementedError, OverflowError,
             SyntaxError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise RecordingError(f"{path}: not a readable NPZ file ({type(error).__name__}); save it again with numpy.savez") from None
+        raise RecordingError(f"{path}: not a readable NPZ file ({type(error).__name__}); save it again with "
+                             "numpy.savez") from None
     return _columns(path, arrays, model)
 
 
@@ -265,7 +269,8 @@ def _columns(path, arrays, model):
                 hint = "; transpose it"
             elif array.ndim == 2 and array.shape[1] != widths[key]:
                 hint = f"; this model has {widths[key]} of them"
-            raise RecordingError(f"{path}: array {key!r} has shape {array.shape} instead of ({len(time)}, {widths[key]}){hint}")
+            raise RecordingError(f"{path}: array {key!r} has shape {array.shape} instead of "
+                                 f"({len(time)}, {widths[key]}){hint}")
         for k in range(widths[key]):
             columns[inverse[key, k]] = array[:, k]
     return columns
@@ -281,7 +286,8 @@ def _minari(path, model):
         import minari
     except ImportError:
         what = "a folder" if os.path.isdir(path) else "neither a file nor a folder"
-        raise RecordingError(f"{path}: {what}; give CSV or NPZ files (a Minari dataset needs: pip install 'minari[hdf5]')") from None
+        raise RecordingError(f"{path}: {what}; give CSV or NPZ files (a Minari dataset needs: pip install "
+                             "'minari[hdf5]')") from None
     try:
         if os.path.isdir(path):
             data = os.path.join(path, "data")
@@ -293,7 +299,8 @@ def _minari(path, model):
         env.close()
         episodes = list(dataset.iterate_episodes())
     except Exception as error:  # whatever an optional package and a broken folder can raise
-        raise RecordingError(f"{path}: not a readable Minari dataset ({error}); give its id, its folder, or CSV files") from None
+        raise RecordingError(f"{path}: not a readable Minari dataset ({error}); give its id, its folder, or CSV "
+                             "files") from None
     name = os.path.basename(os.path.normpath(path))
     return [(f"{path} episode {episode.id}", f"{name}:{episode.id}",
              _columns(path, _episode(path, episode, model, dt), model), 0) for episode in episodes]

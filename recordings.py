@@ -75,8 +75,8 @@ def _recording(path, name, columns, model, first_row):
                 kind, "write nan where nothing was measured, and SI units elsewhere")
             raise RecordingError(f"{path}: row {row + first_row}, column {column!r}: {values[row]:g}; {do}")
     if len(time) < 2:
-        raise RecordingError(f"{path}: {len(time)} row{'s' * (len(time) != 1)}: not enough data; a run needs at least two "
-                             "rows, and some seconds of motion to say anything")
+        raise RecordingError(f"{path}: {len(time)} row{'s' * (len(time) != 1)}: not enough data; a run needs at least "
+                             "two rows, and some seconds of motion to say anything")
     back = np.diff(time) <= 0
     if back.any():
         row = int(np.argmax(back)) + 1
@@ -115,8 +115,9 @@ def _quaternions(path, qpos, model, first_row):
         if bad.any():
             row = int(np.argmax(bad))
             what = "is partly nan" if partly[row] else f"has length {norm[row]:.4g} instead of 1"
-            raise RecordingError(f"{path}: row {row + first_row}, columns 'qpos:{model.joint(j).name or j}:{end - 4 - model.jnt_qposadr[j]}' "
-                                 f"and the next three: the quaternion {what}; order is w x y z")
+            first = f"qpos:{model.joint(j).name or j}:{end - 4 - model.jnt_qposadr[j]}"
+            raise RecordingError(f"{path}: row {row + first_row}, column {first!r} and the next three: the quaternion {what}; "
+                                 "order is w x y z")
 
 
 # --- plausibility ---------------------------------------------------------------------------------------------------
@@ -140,13 +141,14 @@ def check(recordings, model):
         _check_values(recording, model, warn)
         _check_rates(recording, model, warn)
     moving = [recording for recording in recordings if _moves(recording)]
+    everything = recordings[0].name + _more(recordings)
     rows, seconds = sum(len(r.time) for r in moving), sum(r.time[-1] - r.time[0] for r in moving)
     if not moving:
-        raise RecordingError(f"{recordings[0].name}{_more(recordings)}: not enough data: nothing moves beyond the sensors' noise; "
-                             f"move every joint of interest ({ENOUGH})")
+        raise RecordingError(f"{everything}: not enough data: nothing moves beyond the sensors' noise; move every joint of "
+                             f"interest ({ENOUGH})")
     if rows < 20 or seconds < 0.6:
-        raise RecordingError(f"{recordings[0].name}{_more(recordings)}: not enough data: {rows} rows over {seconds:.2g} s; at least "
-                             f"20 rows over 0.6 s are needed, and {ENOUGH}")
+        raise RecordingError(f"{everything}: not enough data: {rows} rows over {seconds:.2g} s; at least 20 rows over 0.6 s "
+                             f"are needed, and {ENOUGH}")
     for recording in recordings:
         if not any(recording is other for other in moving):
             warn(recording, "nothing moves beyond the sensors' noise; it says little")
@@ -180,7 +182,8 @@ def _check_time(recording, model, warn):
     usual = np.median(steps)
     where = f"{recording.name}: column 'time'"
     if usual >= 0.3:
-        unit, factor = ("milliseconds", 1e3) if usual < 300 else ("microseconds", 1e6) if usual < 3e5 else ("nanoseconds", 1e9)
+        unit, factor = next(unit for unit in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
+                            if usual < 0.3 * unit[1] or unit[1] == 1e9)
         raise RecordingError(f"{where}: rows stand {usual:g} s apart, too far to see any dynamics; if these are {unit}, "
                              f"divide by {factor:g}")
     if usual < 1e-6 or usual < model.opt.timestep / 500:
@@ -188,12 +191,13 @@ def _check_time(recording, model, warn):
                              "write seconds")
     row = int(np.argmin(steps))
     if steps[row] < 1e-4 * usual:
-        raise RecordingError(f"{where}: data row {row + 2} stands {steps[row]:.3g} s after the one before (others {usual:.3g} s); "
-                             "no velocity can be formed from these two, remove one")
+        raise RecordingError(f"{where}: data row {row + 2} stands {steps[row]:.3g} s after the one before (others "
+                             f"{usual:.3g} s); no velocity can be formed from these two, remove one")
     row = int(np.argmax(steps))
     if steps[row] > max(20 * usual, 0.1):
-        raise RecordingError(f"{where}: gap of {steps[row]:.3g} s after data row {row + 1}, at {recording.time[row]:.6g} s (rows are {usual:.3g} s apart); "
-                             "split the file there, or write the missing rows with nan positions and their control")
+        raise RecordingError(f"{where}: gap of {steps[row]:.3g} s after data row {row + 1}, at {recording.time[row]:.6g} s "
+                             f"(rows are {usual:.3g} s apart); split the file there, or write the missing rows with nan "
+                             "positions and their control")
     if steps[row] > 5 * usual:
         warn(recording, f"gap of {steps[row]:.3g} s after {recording.time[row]:.6g} s, rows are {usual:.3g} s apart")
 
@@ -210,7 +214,8 @@ def _check_values(recording, model, warn):
         if missing.any():
             share = 100 * missing.mean()
             warn(recording, f"{column} is not measured" if missing.all() else
-                 f"{column} has nan in {share:.0f} % of its rows" if share >= 1 else f"{column} has nan in {missing.sum()} rows")
+                 f"{column} has nan in {share:.0f} % of its rows" if share >= 1 else
+                 f"{column} has nan in {missing.sum()} rows")
             values = values[~missing]
         if len(values) < 2:
             continue
@@ -228,10 +233,11 @@ def _check_values(recording, model, warn):
             speed = np.percentile(jumps / np.diff(recording.time[~missing]), 90)
             if speed > (3000 if hinge else 340):
                 raise RecordingError(f"{where}: moves at {speed:.3g} {'rad/s' if hinge else 'm/s'} most of the time; "
-                                     f"is it in {'degrees' if hinge else 'mm'}? convert it to {'rad' if hinge else 'm'}, and time to s")
+                                     f"is it in {'degrees' if hinge else 'mm'}? convert it to {'rad' if hinge else 'm'}, "
+                                     "and time to s")
             if hinge and abs(jumps[row] - 2 * np.pi) < 0.5 and jumps[row] > 20 * np.median(jumps) + 1e-6:
-                raise RecordingError(f"{where}: jumps by {jumps[row]:.3g} rad after data row {np.flatnonzero(~missing)[row] + 1}, a "
-                                     "wrapped angle; unwrap it (numpy.unwrap)")
+                raise RecordingError(f"{where}: jumps by {jumps[row]:.3g} rad after data row "
+                                     f"{np.flatnonzero(~missing)[row] + 1}, a wrapped angle; unwrap it (numpy.unwrap)")
         else:
             limited, span = model.actuator_ctrllimited[k], model.actuator_ctrlrange[k]
         largest = max(abs(low), abs(high))
@@ -285,7 +291,8 @@ def _check_rates(recording, model, warn):
         if same < 0.5:
             for other, title in enumerate(names):
                 if other != i and (alike(gone[i], travelled[other]) or 0) > max(0.95, same + 0.4):
-                    raise RecordingError(f"{where}: does not follow 'qpos:{name}', but 'qvel:{title}' does; the columns are swapped")
+                    raise RecordingError(f"{where}: does not follow 'qpos:{name}', but 'qvel:{title}' does; the columns "
+                                         "are swapped")
         if same < -0.9:
             raise RecordingError(f"{where}: has the opposite sign of the change of 'qpos:{name}'; turn one of them round")
         if same > 0.9:
@@ -295,6 +302,7 @@ def _check_rates(recording, model, warn):
                 why = next((text for factor, text in ((57.3, "qvel is in degrees"), (1 / 57.3, "qpos is in degrees"),
                             (1000, "qvel is in mm/s, or time in ms"), (1e-3, "qpos is in mm")) if 0.7 < ratio / factor < 1.4),
                            "one of them is in another unit")
-                raise RecordingError(f"{where}: is {ratio:.3g} times the change of 'qpos:{name}' per second; it seems {why}: use SI units")
+                raise RecordingError(f"{where}: is {ratio:.3g} times the change of 'qpos:{name}' per second; it seems {why}: "
+                                     "use SI units")
         elif same < 0.5:
             warn(recording, f"qvel:{name} hardly follows the change of qpos:{name} (correlation {same:.2f})")

@@ -31,7 +31,8 @@ def check_folder(out):
     while not os.path.lexists(here):
         here = os.path.dirname(here)
     if not os.path.isdir(here):
-        raise ReportError(f"{out}: {'is' if here == os.path.abspath(out) else here + ' is'} a file, not a folder; give another --out")
+        what = "is" if here == os.path.abspath(out) else f"{here} is"
+        raise ReportError(f"{out}: {what} a file, not a folder; give another --out")
     if not os.access(here, os.W_OK | os.X_OK):
         raise ReportError(f"{out}: cannot be written; give another --out or change the permissions of {here}")
 
@@ -46,7 +47,8 @@ def write(diagnosis, out):
              "corrected.xml": diagnosis.corrected_xml, "report.html": html_page(diagnosis)}
     for n, curve in enumerate(diagnosis.unknown_curves, start=1):
         rows = zip(np.asarray(curve["x"], float).tolist(), np.asarray(curve["force"], float).tolist())
-        files[f"unknown_{n}.csv"] = f"{curve['variable']},force\n" + "".join(f"{x:.9g},{force:.9g}\n" for x, force in rows)
+        lines = [f"{curve['variable']},force", *(f"{x:.9g},{force:.9g}" for x, force in rows)]
+        files[f"unknown_{n}.csv"] = "\n".join(lines) + "\n"
     made = not os.path.isdir(out)
     waiting = {}
     try:
@@ -66,7 +68,8 @@ def write(diagnosis, out):
                 os.remove(path)
         if made and os.path.isdir(out) and not os.listdir(out):
             os.rmdir(out)
-        raise ReportError(f"{out}: the report cannot be written ({error.strerror or error}); free some space or give another --out") from None
+        raise ReportError(f"{out}: the report cannot be written ({error.strerror or error}); free some space or give "
+                          "another --out") from None
 
 
 def _umask():
@@ -96,10 +99,11 @@ def html_page(diagnosis):
     """The whole page as a string."""
     summary, model = diagnosis.summary, diagnosis.world.model
     title = f"Diagnosis: {wording.model_title(model)}"
-    body = "".join([_head(summary, title), _mechanism(diagnosis), _findings(diagnosis), _prediction(diagnosis), _traces(diagnosis),
-                    _unexplained(diagnosis), _ranking(diagnosis), _advice(diagnosis), _about(diagnosis)])
-    return (f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-            f'<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,"><title>{E(title)}</title>'
+    sections = (_mechanism, _findings, _prediction, _traces, _unexplained, _ranking, _advice, _about)
+    body = _head(summary, title) + "".join(section(diagnosis) for section in sections)
+    return ('<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">'
+            f'<link rel="icon" href="data:,"><title>{E(title)}</title>'
             f"<style>{STYLE}</style></head><body><main>{body}</main><script>{SCRIPT}</script></body></html>\n")
 
 
@@ -113,64 +117,92 @@ def _box(svg, wide=False):
 
 
 def _legend(*looks):
-    return '<p class="legend">' + "".join(f'<span><i class="{look}"></i>{E(words)}</span>' for look, words in looks) + "</p>"
+    items = "".join(f'<span><i class="{look}"></i>{E(words)}</span>' for look, words in looks)
+    return f'<p class="legend">{items}</p>'
+
+
+def _pair(*parts):
+    """Side by side where there is room."""
+    inside = "".join(f"<div>{part}</div>" for part in parts if part)
+    return f'<div class="pair">{inside}</div>' if inside else ""
+
+
+def _table(heads, rows):
+    """heads: texts; rows: lists of cells in HTML, a first cell that starts with "*" marks the row. "" without rows."""
+    if not rows:
+        return ""
+    body = ""
+    for row in rows:
+        chosen = ' class="chosen"' if row[0].startswith("*") else ""
+        body += f"<tr{chosen}>" + "".join(f"<td>{cell}</td>" for cell in [row[0].lstrip("*"), *row[1:]]) + "</tr>"
+    head = "".join(f"<th>{E(text)}</th>" for text in heads)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _head(summary, title):
     findings = "".join(f"<li>{E(wording.finding_words(finding))}</li>" for finding in summary["findings"])
     before, after, floor, unit, place = wording.errors(summary)
     steps = "".join(f'<div class="{look}"><b>{E(value)} <small>{E(unit)}</small></b><span>{words}</span></div>'
-                    for value, look, words in ((before, "nominal", "nominal model"), (after, "corrected", "corrected model"), (floor, "noise", "noise alone")))
+                    for value, look, words in ((before, "nominal", "nominal model"), (after, "corrected", "corrected model"),
+                                               (floor, "noise", "noise alone")))
     left = wording.unexplained_words(summary)
-    return (f'<header><p class="kicker">{E(title)}</p><h1 class="{summary["verdict"]}">{E(wording.verdict_words(summary))}</h1>'
-            f'{f"<ol class=verdict>{findings}</ol>" if findings else ""}'
-            f'<p>{E(wording.sentence(wording.error_words(summary)))}{" " + E(wording.sentence(left)) if left else ""}</p>'
-            f'<div class="steps">{steps}</div><p class="note">Error{E(place)} on recordings held out, '
-            f'{summary["fit"]["held_out"].get("horizon_s", 0.3):g} s ahead.</p></header>')
+    sentences = " ".join(map(wording.sentence, [wording.error_words(summary), *([left] if left else [])]))
+    horizon = summary["fit"]["held_out"].get("horizon_s", 0.3)
+    return (f'<header><p class="kicker">{E(title)}</p>'
+            f'<h1 class="{summary["verdict"]}">{E(wording.verdict_words(summary))}</h1>'
+            f'{f"<ol class=verdict>{findings}</ol>" if findings else ""}<p>{E(sentences)}</p><div class="steps">{steps}</div>'
+            f'<p class="note">Error{E(place)} on recordings held out, {horizon:g} s ahead.</p></header>')
 
 
 def _mechanism(diagnosis):
     summary, model = diagnosis.summary, diagnosis.world.model
-    labels = [wording.effect_words(f["effect"]) + (f" ({f['place']['name']})" if f["place"]["kind"] != "world" else "") for f in summary["findings"]]
-    poses = motion.poses(model, diagnosis.held_out)
-    picture = drawing.mechanism(model, poses, [f["place"] for f in summary["findings"]], labels)
+    places = [finding["place"] for finding in summary["findings"]]
+    labels = [wording.effect_words(finding["effect"]) + ("" if place["kind"] == "world" else f" ({place['name']})")
+              for finding, place in zip(summary["findings"], places)]
+    picture = drawing.mechanism(model, motion.poses(model, diagnosis.held_out), places, labels)
     moving = motion.overlay(diagnosis)
     film = ""
     if moving:
         recording, start, seconds, motions = moving
-        film = (drawing.animation(model, motions, seconds)
-                + f'<p class="note">{E(recording)} from {wording.number(start)} s: both models start from the recorded state and are driven by the '
-                f"recorded control for {wording.number(seconds, 2)} s. Of the held-out stretches, the one where the nominal model errs most.</p>"
+        note = (f"{recording} from {wording.number(start)} s: both models start from the recorded state and are driven by the "
+                f"recorded control for {wording.number(seconds, 2)} s. Of the held-out stretches, the one where the nominal "
+                "model errs most.")
+        film = (drawing.animation(model, motions, seconds) + f'<p class="note">{E(note)}</p>'
                 + _legend(("measured", "recorded"), ("nominal", "nominal"), ("corrected", "corrected")))
-    return _section("The mechanism", f'<div class="pair"><div>{_box(picture)}</div>{f"<div>{film}</div>" if film else ""}</div>')
+    return _section("The mechanism", _pair(_box(picture), film))
 
 
 def _findings(diagnosis):
-    cards = []
     left = leftover.residuals(diagnosis)
+    cards = []
     for i, finding in enumerate(diagnosis.summary["findings"]):
-        rows = "".join(f"<tr><td>{E(p['name'])}</td><td>{E(wording.estimate(p))}</td><td>{E(wording.number(p['nominal']))}</td>"
-                       f"<td>{whisker(p)}</td></tr>" for p in finding["parameters"])
-        table = (f'<div class="scroll"><table><thead><tr><th>parameter</th><th>value, 95 %</th><th>nominal</th><th></th></tr></thead>'
-                 f"<tbody>{rows}</tbody></table></div>") if rows else ""
-        plots = "".join(_residual(r) for r in left if r["finding"] == i)
-        curves = "".join(_box(chart([Series(c["x"], c["force"], "corrected")], wording.axis_words(c["variable"]), f"force ({c['unit']})",
-                                    label="the unknown force")) for c in diagnosis.unknown_curves if c["finding"] == i)
-        evidence = finding.get("evidence") or {}
-        facts = []
-        if evidence.get("held_out_error_removed") is not None:
-            facts.append(f"removes {100 * evidence['held_out_error_removed']:.0f} % of the held-out error")
-        if evidence.get("p_value") is not None:
-            facts.append(f"p {wording.p_value(evidence['p_value'])}")
-        facts += [f"{key.replace('_', ' ')} {wording.number(value)}" for key, value in evidence.items()
-                  if key not in ("held_out_error_removed", "p_value") and isinstance(value, (int, float)) and not isinstance(value, bool)]
-        facts.append({"mjcf": "held in corrected.xml", "measurement": "a property of the measurement, so not in corrected.xml",
-                      "none": "has no plain MJCF form, so not in corrected.xml"}[finding["written_as"]])
+        table = _table(["parameter", "value, 95 %", "nominal", ""],
+                       [[E(p["name"]), E(wording.estimate(p)), E(wording.number(p["nominal"])), whisker(p)]
+                        for p in finding["parameters"]])
+        plots = [_residual(r) for r in left if r["finding"] == i]
+        plots += [_curve(c) for c in diagnosis.unknown_curves if c["finding"] == i]
         others = "".join(f"<li>{E(wording.finding_words(other))}</li>" for other in finding.get("also_possible") or [])
         others = f'<p class="or">These recordings cannot tell it from:</p><ul>{others}</ul>' if others else ""
-        cards.append(f'<article class="card"><h3>{i + 1}. {E(wording.finding_words(finding))}</h3><p class="facts">{E("; ".join(facts))}</p>'
-                     f'{table}<div class="pair">{plots}{curves}</div>{others}</article>')
+        cards.append(f'<article class="card"><h3>{i + 1}. {E(wording.finding_words(finding))}</h3>'
+                     f'<p class="facts">{E("; ".join(_facts(finding)))}</p>{table}{_pair(*plots)}{others}</article>')
     return _section("What is wrong, in order of importance", *cards)
+
+
+def _facts(finding):
+    """The evidence for a finding, in words."""
+    facts = []
+    for key, value in (finding.get("evidence") or {}).items():
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            facts.append(f"removes {100 * value:.0f} % of the held-out error" if key == "held_out_error_removed" else
+                         f"p {wording.p_value(value)}" if key == "p_value" else
+                         f"{key.replace('_', ' ')} {wording.number(value)}")
+    return facts + [{"mjcf": "held in corrected.xml", "none": "has no plain MJCF form, so not in corrected.xml",
+                     "measurement": "a property of the measurement, so not in corrected.xml"}[finding["written_as"]]]
+
+
+def _curve(curve):
+    return _box(chart([Series(curve["x"], curve["force"], "corrected")], wording.axis_words(curve["variable"]),
+                      f"force ({curve['unit']})", label="the unknown force"))
 
 
 def _residual(residual):
@@ -181,30 +213,30 @@ def _residual(residual):
     before, after = (np.where(np.abs(y) < reach, y, np.nan) for y in (before, after))
     picture = chart([Series(x, before, "nominal faint", "dots"), Series(x, after, "corrected faint", "dots"),
                      Series(*binned(x, before), "nominal"), Series(*binned(x, after), "corrected")],
-                    wording.axis_words(residual["variable"], residual["x_unit"]), f"force left at {residual['joint']} ({unit})", label="residual against " + residual["variable"])
-    legend = _legend(("nominal", "left over by the nominal model"), ("corrected", "by the corrected one"))
-    return f"<div>{legend}{_box(picture)}</div>" if picture else ""
+                    wording.axis_words(residual["variable"], residual["x_unit"]), f"force left at {residual['joint']} ({unit})",
+                    label="residual against " + residual["variable"])
+    return picture and _legend(("nominal", "left over by the nominal model"), ("corrected", "by the corrected one")) + _box(picture)
 
 
 def _prediction(diagnosis):
     fit = diagnosis.summary["fit"]["held_out"]
-    curve = fit.get("curve") or []
-    picture = ""
+    curve, picture = fit.get("curve") or [], ""
     if curve:
         x, before, after, floor = (np.array([np.nan if point.get(key) is None else point[key] for point in curve], dtype=float)
                                    for key in ("seconds", "before", "after", "floor"))
-        spread = np.nanmax(before) > 8 * max(np.nanmin(after), 1e-12)
-        picture = (_legend(("nominal", "nominal"), ("corrected", "corrected"), *([("noise", "noise alone")] if np.isfinite(floor).any() else []))
-                   + _box(chart([Series(x, before, "nominal"), Series(x, after, "corrected"), Series(x, floor, "noise")], "horizon (s)",
-                                "error (× noise)", log_y=bool(spread), zero=not spread, label="error against horizon")))
+        wide = np.nanmax(before) > 8 * max(np.nanmin(after), 1e-12)
+        noise = [("noise", "noise alone")] if np.isfinite(floor).any() else []
+        lines = [Series(x, before, "nominal"), Series(x, after, "corrected"), Series(x, floor, "noise")]
+        picture = (_legend(("nominal", "nominal"), ("corrected", "corrected"), *noise)
+                   + _box(chart(lines, "horizon (s)", "error (× noise)", log_y=bool(wide), zero=not wide,
+                                label="error against horizon")))
     rows = []
-    for name, c in (fit.get("channels") or {}).items():
-        unit, factor = wording.SMALL.get(c["unit"], (c["unit"], 1))
-        cells = "".join(f"<td>{'–' if c[key] is None else wording.number(c[key] * factor, 2)}</td>" for key in ("before", "after", "floor"))
-        rows.append(f"<tr><td>{E(name)}</td>{cells}<td>{E(unit)}</td></tr>")
-    table = (f'<div class="scroll"><table class="numbers"><thead><tr><th>channel</th><th>nominal</th><th>corrected</th><th>noise</th><th></th></tr></thead>'
-             f"<tbody>{''.join(rows)}</tbody></table></div>") if rows else ""
-    return _section("How well it predicts recordings it was not fitted to", f'<div class="pair"><div>{picture}</div><div>{table}</div></div>')
+    for name, channel in (fit.get("channels") or {}).items():
+        unit, factor = wording.SMALL.get(channel["unit"], (channel["unit"], 1))
+        values = (None if channel[key] is None else channel[key] * factor for key in ("before", "after", "floor"))
+        rows.append([E(name), *(wording.number(value, 2) for value in values), E(unit)])
+    table = _table(["channel", "nominal", "corrected", "noise alone", ""], rows)
+    return _section("How well it predicts recordings it was not fitted to", _pair(picture, table))
 
 
 def _traces(diagnosis):
@@ -221,9 +253,11 @@ def _traces(diagnosis):
         time = np.asarray(trace["time"], float)
         values = {look: np.asarray(trace[look], float) for look in ("measured", "nominal", "corrected")}
         joint = np.isnan(list(values.values())).all(axis=0)  # between two predictions; the recording runs on
-        lines = [Series(time[~joint], values["measured"][~joint], "measured"), *(Series(time, values[look], look) for look in ("nominal", "corrected"))]
+        lines = [Series(time[~joint], values["measured"][~joint], "measured"),
+                 *(Series(time, values[look], look) for look in ("nominal", "corrected"))]
+        name = trace["channel"].split(":", 1)[-1]
         return (f'<h3 class="trace">{E(trace["channel"])} <small>{E(trace["recording"])}</small></h3>'
-                + _box(chart(lines, "time (s)", trace["channel"].split(":", 1)[-1], 900, 240, label=f"{trace['channel']} over time"), wide=True))
+                + _box(chart(lines, "time (s)", name, 900, 240, label=f"{name} over time"), wide=True))
 
     legend = _legend(("measured", "recorded"), ("nominal", "nominal"), ("corrected", "corrected"))
     folded = f"<details><summary>{len(more)} more</summary>{''.join(map(draw, more))}</details>" if more else ""
@@ -243,13 +277,10 @@ def _ranking(diagnosis):
         place, removed = candidate["place"], candidate["error_removed"]
         share = 0 if removed is None or not math.isfinite(removed) else min(1, max(0, removed))
         found = (candidate["effect"], place["kind"], place["name"]) in chosen
-        rows.append(f'<tr{" class=chosen" if found else ""}><td>{E(wording.effect_words(candidate["effect"]))}</td><td>{E(wording.place_words(place))}</td>'
-                    f'<td><span class="bar"><i style="width:{100 * share:.0f}%"></i></span> {100 * share:.0f} %</td>'
-                    f'<td>{E(wording.p_value(candidate["p_value"]))}</td></tr>')
-    if not rows:
-        return ""
-    return _section("Candidates", f'<div class="scroll"><table><thead><tr><th>effect</th><th>place</th><th>error it removes alone</th><th>p</th></tr></thead>'
-                    f"<tbody>{''.join(rows)}</tbody></table></div>",
+        bar = f'<span class="bar"><i style="width:{100 * share:.0f}%"></i></span> {100 * share:.0f} %'
+        rows.append(["*" * found + E(wording.effect_words(candidate["effect"])), E(wording.place_words(place)), bar,
+                     E(wording.p_value(candidate["p_value"]))])
+    return _section("Candidates", _table(["effect", "place", "error it removes alone", "p"], rows),
                     note="Each effect at each place, on its own, against the nominal model. Marked: in the diagnosis.")
 
 
@@ -265,4 +296,5 @@ def _about(diagnosis):
     train, held = (", ".join(dict.fromkeys(r.name for r in part)) for part in (diagnosis.train, diagnosis.held_out))
     return _section("The recordings", f"<p>Fitted: {E(train)}.<br>Held out: {E(held)}.<br>Noise (SI): {E(noise)}.</p>",
                     f"<ul>{notes}</ul>" if notes else "",
-                    "<p class=note>Beside this page: diagnosis.json (all numbers) and corrected.xml (the corrected model, for stock MuJoCo).</p>")
+                    '<p class="note">Beside this page: diagnosis.json (all numbers) and corrected.xml (the corrected model, for stock '
+                    "MuJoCo).</p>")

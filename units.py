@@ -10,8 +10,8 @@ import leftover
 
 CENTRES = 400  # rows at which the law is tested
 UNLIKE = 0.35  # imbalance (0: the law holds, 1: one side dwarfs the other) above which a reading can be wrong;
-UNIT_GAIN, SWAP_GAIN = 2, 3  # the right one divides it by so much. Missing friction alone reaches 0.7, but no wrong reading
-# betters that so.
+UNIT_GAIN, SWAP_GAIN = 2, 3  # the right one divides it by so much
+# (missing friction alone reaches 0.7, but no wrong reading betters that so)
 
 
 def suspect(recording, model):
@@ -37,7 +37,8 @@ def suspect(recording, model):
     if model.nv > 1:
         readings.append(("the positions seem to be in " + " or ".join(sorted({unit for unit, _ in units})), list(joints), UNIT_GAIN,
                          _scaled(states, np.array([factor for _, factor in units]), 1)))
-    readings.append(("column 'time' seems to be in ms; convert to s", list(joints), UNIT_GAIN, _scaled(states, np.ones(model.nv), 1e-3)))
+    readings.append(("column 'time' seems to be in ms; convert to s", list(joints), UNIT_GAIN,
+                     _scaled(states, np.ones(model.nv), 1e-3)))
     for i in joints:
         for j in range(i):
             if model.jnt_type[i] == model.jnt_type[j]:

@@ -64,7 +64,7 @@ def finding_words(finding):
         values = ", ".join((f"{p['name']} " if len(parameters) > 1 else "") + estimate(p) for p in parameters)
         sentence = f"{place}: {effect} {values} was left out"
     else:
-        values = ", ".join((f"{p['name']} " if len(parameters) > 1 or p["name"] not in effect else "") + change(p) for p in parameters)
+        values = ", ".join(("" if len(parameters) == 1 and p["name"] in effect else f"{p['name']} ") + change(p) for p in parameters)
         sentence = f"{place}: {effect}{':' if values[0].isalpha() else ''} {values}"
     return sentence + when_words(finding.get("when"))
 
@@ -97,8 +97,8 @@ def depends_words(depends_on):
 
 
 def errors(summary):
-    """Held-out error as words (before, after, floor, unit, place): in SI at the channel in which the two models differ most
-    (counted in noise), or over all channels in multiples of the noise."""
+    """Held-out error as words (before, after, floor, unit, place): in SI at the channel in which the two models differ
+    most (counted in noise), or over all channels in multiples of the noise."""
     fit = summary["fit"]["held_out"]
     channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"]}
     if not channels:
@@ -139,7 +139,8 @@ def terminal(summary, out):
     lines = [verdict_words(summary)]
     for finding in summary["findings"]:
         lines.append(f"  {finding_words(finding)}")
-        rivals = ", ".join(f"{effect_words(other['effect'])} of {place_words(other['place'])}" for other in finding.get("also_possible") or [])
+        rivals = ", ".join(f"{effect_words(other['effect'])} of {place_words(other['place'])}"
+                           for other in finding.get("also_possible") or [])
         lines += [f"    (these recordings cannot tell it from: {rivals})"] if rivals else []
     lines.append(sentence(error_words(summary)))
     left = unexplained_words(summary)
