@@ -27,7 +27,7 @@ from recordings import RecordingError
 
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
 FINAL_STEPS = 30000
-LEAST_ROWS, LEAST_WINDOWS = 8, 20
+LEAST_ROWS, LEAST_WINDOWS, FEW_ROWS = 8, 20, 100
 LEFTOVER_SPANS, LEFTOVER_WORTH = (0.2, 0.1), 0.02  # s; share of the nominal's squared residual that a leftover must explain
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
 ROUNDS = 3  # of search, each with longer windows
@@ -83,6 +83,7 @@ def identify(world, train, held_out, progress=None):
     if hypothesis.effects:
         [fit] = shooting.solve(final, [hypothesis], fit)
     say(0.9, "held-out error")
+    position_noise, velocity_noise = lowered_noise(world, train, position_noise, velocity_noise, hypothesis)
     return assemble(world, train, held_out, fit, selection.Search(world, final, train), possible, left, event, ranking,
                     position_noise, velocity_noise)
 
@@ -118,23 +119,27 @@ def noise_of(world, train):
 
     Both are upper bounds: differences where the control jumps at every row, the model where it is wrong.
     """
-    model = world.model
-    position, velocity = cut.measurement_noise(model, train)
+    position, velocity = cut.measurement_noise(world.model, train)
     if not np.isfinite(position).any() and not np.isfinite(velocity).any():
         raise RecordingError("not enough data: recordings need at least ten measured rows in some qpos column")
-    sample = np.median([np.median(np.diff(r.time)) for r in train])
     for _ in range(2):
-        problem = problem_of(world, train, position, velocity, None, LEAST_ROWS * sample, SEARCH_STEPS)
-        fit = shooting.fit_starts(problem, shooting.Hypothesis())
-        weight = problem.weight
-        square = np.where(weight > 0, fit.residual[:, :weight[0].size].reshape(weight.shape) / np.where(weight > 0, weight, 1), 0) ** 2
-        rows = (weight > 0).sum(1)  # (W, 2 nv)
-        left = np.array([np.sqrt(np.median(s[r > 3] / (r[r > 3] - 2))) if (r > 3).any() else np.inf
-                         for s, r in zip(square.sum(1).T, rows.T)])
-        for dofs in cut.channels(model).values():
-            left[dofs] = np.sqrt(np.mean(left[dofs] ** 2))
-        position, velocity = np.minimum(position, left[:model.nv]), np.minimum(velocity, left[model.nv:])
+        position, velocity = lowered_noise(world, train, position, velocity, shooting.Hypothesis())
     return position, velocity
+
+
+def lowered_noise(world, train, position, velocity, hypothesis):
+    """Noise (nv,), (nv,) as given, or less where a model leaves less of short windows."""
+    model = world.model
+    sample = np.median([np.median(np.diff(r.time)) for r in train])
+    problem = problem_of(world, train, position, velocity, None, LEAST_ROWS * sample, SEARCH_STEPS)
+    fit, weight = shooting.fit_starts(problem, hypothesis), problem.weight
+    gap = fit.residual[:, :weight[0].size].reshape(weight.shape) / np.where(weight > 0, weight, 1)
+    square, rows = np.where(weight > 0, gap**2, 0).sum(1), (weight > 0).sum(1)  # (W, 2 nv)
+    left = np.array([np.sqrt(np.median(s[r > 3] / (r[r > 3] - 2))) if (r > 3).any() else np.inf for s, r in zip(square.T, rows.T)])
+    left = np.maximum(left, 1e-9)
+    for dofs in cut.channels(model).values():
+        left[dofs] = np.sqrt(np.mean(left[dofs] ** 2))
+    return np.minimum(position, left[:model.nv]), np.minimum(velocity, left[model.nv:])
 
 
 def windows_for(world, recordings, span, steps, event=None):
@@ -180,7 +185,7 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
     sample = np.median([np.median(np.diff(r.time)) for r in train])
     duration = np.median([np.ptp(r.time) for r in train])
     shortest = max(LEAST_ROWS * sample, at_least)
-    if duration < 60 * sample:  # too short to be cut
+    if sum(len(r.time) for r in train) < FEW_ROWS:  # too little to be cut
         return float(duration)
     longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration))
 

@@ -65,6 +65,8 @@ def options_of(world, recordings):
         else:
             moved = shooting.perturbed(shooting.Hypothesis(((candidate, candidate.nominal),)))[0]
             out.append(Option(candidate, tuple(m[candidate] for m in moved), True))
+            if candidate.effect.name == "mass":  # far from its nominal a mass does not act in proportion
+                out += [Option(candidate, ((factor * candidate.nominal[0],),), False) for factor in (4.0, 20.0)]
     return out
 
 
@@ -349,9 +351,10 @@ class Search:
                     fit = new
                     possible.update({c: [] for c in added})
                     continue
-            equals = [(small, candidate)] + [(f, c) for f, c in others if not self.worse(f, small)]
+            near = lambda f, c: simplicity(c)[:2] < simplicity(candidate)[:2] and f.chi2.sum() < (1 + WORTH) * small.chi2.sum()
+            equals = [(small, candidate)] + [(f, c) for f, c in others if near(f, c) or not self.worse(f, small)]
             best, name = min(equals, key=lambda e: simplicity(e[1]))
-            better = [e for e in equals if self.worse(small, e[0])]
+            better = [e for e in equals if self.worse(small, e[0]) and e[0].chi2.sum() < (1 - WORTH) * small.chi2.sum()]
             if better:
                 best, name = min(better, key=lambda e: e[0].chi2.sum())
             if name != candidate:
@@ -435,5 +438,5 @@ class Search:
 
 
 def simplicity(candidate):
-    """What to prefer among effects that the data cannot tell apart."""
-    return len(candidate.parameters), candidate.effect.simplicity
+    """What to prefer among effects that the data cannot tell apart: the simulator's own step, then few parameters."""
+    return candidate.effect.name != "time_step", len(candidate.parameters), candidate.effect.simplicity
