@@ -42,6 +42,7 @@ svg text{font-family:inherit;fill:var(--ink)}
 .wide .line{stroke-width:1.5}.wide .measured.line{stroke-width:4;opacity:.3;stroke-linecap:round}
 .measured{stroke:var(--measured)}.nominal{stroke:var(--nominal)}.corrected{stroke:var(--corrected)}
 .noise{stroke:var(--noise);stroke-dasharray:5 4}
+.band{fill:var(--corrected);fill-opacity:.15;stroke:none}
 .dots{fill:none;stroke-width:3;stroke-linecap:round;opacity:.22}
 .whisker{width:220px;height:34px}
 .tickmark{stroke-width:3}.whisk{stroke-width:3;stroke-linecap:round}.point{fill:var(--corrected)}

@@ -45,7 +45,7 @@ def write(diagnosis, out):
     """
     files = {"diagnosis.json": json.dumps(plain(diagnosis.summary), indent=2, allow_nan=False, ensure_ascii=False) + "\n",
              "corrected.xml": diagnosis.corrected_xml, "report.html": html_page(diagnosis)}
-    for n, curve in enumerate(diagnosis.unknown_curves, start=1):
+    for n, curve in enumerate(unknown_curves(diagnosis), start=1):
         rows = zip(np.asarray(curve["x"], float).tolist(), np.asarray(curve["force"], float).tolist())
         lines = [f"{curve['variable']},force", *(f"{x:.9g},{force:.9g}" for x, force in rows)]
         files[f"unknown_{n}.csv"] = "\n".join(lines) + "\n"
@@ -173,14 +173,15 @@ def _mechanism(diagnosis):
 
 
 def _findings(diagnosis):
-    left = leftover.residuals(diagnosis)
+    left, curves = leftover.residuals(diagnosis), unknown_curves(diagnosis)
     cards = []
     for i, finding in enumerate(diagnosis.summary["findings"]):
-        table = _table(["parameter", "value, 95 %", "nominal", ""],
-                       [[E(p["name"]), E(wording.estimate(p)), E(wording.number(p["nominal"])), whisker(p)]
-                        for p in finding["parameters"]])
+        curve = next((c for c in curves if c["finding"] == i), None)
+        table = "" if curve else _table(["parameter", "value, 95 %", "nominal", ""],
+                                        [[E(p["name"]), E(wording.estimate(p)), E(wording.number(p["nominal"])), whisker(p)]
+                                         for p in finding["parameters"]])
         plots = [_residual(r) for r in left if r["finding"] == i]
-        plots += [_curve(c) for c in diagnosis.unknown_curves if c["finding"] == i]
+        plots += [_curve(curve, finding["parameters"])] if curve else []
         others = "".join(f"<li>{E(wording.finding_words(other))}</li>" for other in finding.get("also_possible") or [])
         others = f'<p class="or">These recordings cannot tell it from:</p><ul>{others}</ul>' if others else ""
         cards.append(f'<article class="card"><h3>{i + 1}. {E(wording.finding_words(finding))}</h3>'
@@ -200,8 +201,22 @@ def _facts(finding):
                      "measurement": "a property of the measurement, so not in corrected.xml"}[finding["written_as"]]]
 
 
-def _curve(curve):
-    return _box(chart([Series(curve["x"], curve["force"], "corrected")], wording.axis_words(curve["variable"]),
+def unknown_curves(diagnosis):
+    """[{finding: index, variable, x, force (n,), unit}]: the fitted curves of findings that the catalogue cannot name."""
+    curves = []
+    for index, finding in enumerate(diagnosis.summary["findings"]):
+        for candidate, values in diagnosis.settings.items():
+            if finding["effect"] == "unknown" == candidate.effect.name and candidate.place.name == finding["place"]["name"]:
+                curves.append({"finding": index, "variable": candidate.effect.variable, "x": np.array(candidate.effect.knots),
+                               "force": np.array(values), "unit": candidate.parameters[0].unit})
+    return curves
+
+
+def _curve(curve, parameters):
+    """The unknown force against its variable, with the 95 % interval at each knot."""
+    band = np.array([[p.get("low", np.nan), p.get("high", np.nan)] for p in parameters], dtype=float)
+    lines = [Series(curve["x"], band, "corrected", "band")] if len(band) == len(curve["x"]) and np.isfinite(band).all() else []
+    return _box(chart([*lines, Series(curve["x"], curve["force"], "corrected")], wording.axis_words(curve["variable"]),
                       f"force ({curve['unit']})", label="the unknown force"))
 
 

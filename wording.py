@@ -56,7 +56,8 @@ def finding_words(finding):
     place, effect = place_words(finding["place"]), effect_words(finding["effect"])
     if finding["effect"] == "unknown":
         on = depends_words(finding.get("depends_on"))
-        return f"{place}: a force that the catalogue has no name for{f', depending on {on}' if on else ''}"
+        return (f"{place}: a force that the catalogue has no name for{f', depending on {on}' if on else ''}"
+                + when_words(finding.get("when")))
     parameters = finding["parameters"]
     if not parameters:
         return f"{place}: {effect}"

@@ -18,6 +18,7 @@ sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import drawing
 import experiments
 import figures
+import joints
 import leftover
 import motion
 import report
@@ -58,17 +59,20 @@ def diagnosis():
                "corrected": np.where(np.arange(len(r.time)) % 30 == 0, np.nan, r.qpos[:, k])} for r in held for k, name in enumerate(("shoulder", "elbow"))]
     ranking = [{"effect": "coulomb_friction", "place": {"kind": "joint", "name": "elbow"}, "error_removed": 0.6, "p_value": 0.0},
                {"effect": "wind", "place": {"kind": "world", "name": "world"}, "error_removed": float("nan"), "p_value": float("nan")}]
-    curves = [{"finding": 1, "variable": "position:elbow", "x": np.linspace(-1, 1, 9), "force": np.linspace(0, 1, 9), "unit": "N·m"}]
+    knots, force = np.linspace(-1, 1, 9), np.linspace(0, 1, 9)
+    findings.append({**finding("unknown", "joint", "shoulder", 0, 0, 1, "", depends_on=["position:elbow"]),
+                     "parameters": [{"name": f"force {k}", "nominal": 0.0, "value": f, "low": f - 0.1, "high": f + 0.1, "unit": "N·m"}
+                                    for k, f in enumerate(force)]})
     return types.SimpleNamespace(
         summary=summary, corrected_xml=ARM.replace('range="-2.9', 'frictionloss="0.12" range="-2.9'), world=types.SimpleNamespace(model=arm()),
-        settings={"elbow": (0.12,)}, ranking=ranking, traces=traces,
-        train=train, held_out=held, unknown_curves=curves)
+        settings={joints.curve(arm(), "shoulder", "position:elbow", knots): force}, ranking=ranking, traces=traces,
+        train=train, held_out=held)
 
 
 @pytest.fixture
 def matched(diagnosis):
     diagnosis.summary = {**diagnosis.summary, "verdict": "match", "findings": [], "warnings": []}
-    diagnosis.settings, diagnosis.unknown_curves = {}, []
+    diagnosis.settings = {}
     return diagnosis
 
 
@@ -315,7 +319,7 @@ def test_page_is_well_formed_and_self_contained(kind, request):
 def test_page_says_it_all(diagnosis):
     page = report.html_page(diagnosis)
     for words in ("joint elbow: Coulomb friction 0.120 ± 0.004 N·m was left out", "dead zone", "push the joint by hand with the actuator off",
-                  "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "force left at elbow (N·m)", "badmark"):
+                  "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "force (N·m)", "a force that the catalogue has no name for", "force left at elbow (N·m)", "badmark"):
         assert words in page, words
 
 
