@@ -224,7 +224,7 @@ def _residual(residual):
     """Force left over against the variable that it depends on, before and after, with the bins' medians."""
     x, before, after = (np.asarray(residual[key], float) for key in ("x", "before", "after"))
     unit = residual["unit"]
-    reach = 1.5 * np.nanpercentile(np.abs(before), 97)  # impacts would flatten the picture
+    reach = 1.5 * np.nanpercentile(np.abs(before), 90)  # impacts would flatten the picture
     before, after = (np.where(np.abs(y) < reach, y, np.nan) for y in (before, after))
     picture = chart([Series(x, before, "nominal faint", "dots"), Series(x, after, "corrected faint", "dots"),
                      Series(*binned(x, before), "nominal"), Series(*binned(x, after), "corrected")],
