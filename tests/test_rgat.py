@@ -1,0 +1,304 @@
+"""Grounding methods: rewards and transformers by hand, the oracle against brute force, strangers training in the grounded sim."""
+import copy
+import os
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+sys.path.insert(0, ROOT)
+sys.path.append(os.path.join(ROOT, "benchmarks"))  # last: its trpo.py is another
+from envs import BatchEnv, parse_perturbation, task_of
+from models import GaussianPolicy
+from rgat import (
+    ANE,
+    AT_CONFIG,
+    GAT,
+    RGAT,
+    ActionTransformer,
+    ActionTransformerEnv,
+    Grounding,
+    GroundedEnv,
+    GroundingSettings,
+    Oracle,
+    RealModel,
+    identity,
+    measured,
+    one_step_error,
+    predict_all,
+)
+from trpo import Transitions, TRPOConfig, rollouts
+
+pytestmark = pytest.mark.filterwarnings("ignore")
+SMALL = GroundingSettings(at=replace(AT_CONFIG, batch_size=64))
+
+
+def world(env_id, n=4, real=False):
+    return BatchEnv(env_id, n, parse_perturbation(task_of(env_id).real) if real else (), nthread=1)
+
+
+def policy_for(env, seed=0, std=0.3):
+    torch.manual_seed(seed)
+    policy = GaussianPolicy(env.single_observation_space.shape[0], env.single_action_space.shape[0], log_std=np.log(std))
+    policy.net[-1].weight.data.normal_(std=0.2)
+    return policy
+
+
+def real_data(env_id, episodes=8):
+    real = world(env_id, real=True)
+    return rollouts(policy_for(real), real, episodes, seed=1)[1]
+
+
+class Prophet:
+    """Stands for f_psi: says where it is told to."""
+
+    def __init__(self, predicted, guess, residual):
+        self.predicted, self.guess, self.residual = predicted, guess, residual
+
+    def __call__(self, s, a):
+        return self.predicted, self.guess
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_the_transformers_reward_by_hand(residual):
+    sim, twin = world("Hopper-v4"), world("Hopper-v4")
+    rng = np.random.default_rng(0)
+    predicted, guess = rng.normal(size=(2, 4, 11)).astype(np.float32)
+    low, high = sim.single_action_space.low, sim.single_action_space.high
+    transformer = ActionTransformer(GaussianPolicy(14, 3), low, high)
+    env = ActionTransformerEnv(sim, transformer, policy_for(sim), Prophet(predicted, guess, residual), seed=3)
+    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    sa, _ = env.reset(seed=5)
+    s, _ = twin.reset(seed=5)
+    cut = 0
+    for _ in range(60):
+        np.testing.assert_array_equal(sa[:, :11], s.astype(np.float32))
+        a, output = sa[:, 11:], rng.uniform(-0.3, 0.3, (4, 3))
+        s, _, fell, timeout, info = twin.step(a, applied=np.clip(a + 2 * output, -1, 1))  # the range of an action is 2
+        sa, reward, terminated, truncated, at_info = env.step(output)
+        expected = [-sum((float(p) - x) ** 2 for p, x in zip(predicted[i], info["next_obs"][i])) for i in range(4)]
+        if residual:
+            expected += ((predicted.astype(float) - guess) ** 2).sum(1)
+        np.testing.assert_allclose(reward, expected, rtol=1e-5, atol=1e-5)
+        assert not terminated.any()  # ending an episode must never pay
+        np.testing.assert_array_equal(truncated, fell | timeout)
+        np.testing.assert_array_equal(at_info["next_obs"][:, :11], info["next_obs"].astype(np.float32))
+        cut += truncated.sum()
+    assert cut > 0
+
+
+def test_the_transformer_sees_the_target_policys_actions():
+    sim = world("HalfCheetah-v4", n=2000)
+    policy = policy_for(sim)
+    env = ActionTransformerEnv(sim, None, policy, None, seed=0)
+    sa, _ = env.reset(seed=0)
+    with torch.no_grad():
+        z = (sa[:, 17:] - policy.mean(torch.from_numpy(sa[:, :17])).numpy()) / 0.3
+    inside = np.abs(sa[:, 17:]).max(1) < 1
+    assert abs(z[inside].std() - 1) < 0.1 and np.abs(sa[:, 17:]).max() <= 1
+    assert env.single_observation_space.shape == (23,)
+
+
+def test_action_transformer_adds_its_mean_and_stays_in_bounds():
+    policy = GaussianPolicy(4 + 1, 1, log_std=0.0)
+    for p in policy.net.parameters():
+        p.data.zero_()
+    policy.net[-1].bias.data.fill_(0.25)
+    transform = ActionTransformer(policy, np.array([-3.0]), np.array([3.0]))
+    np.testing.assert_allclose(transform(np.zeros((3, 4)), np.array([[-3.0], [0.0], [2.9]])), [[-1.5], [1.5], [3.0]], atol=1e-6)
+
+
+# --- f_psi --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_the_model_of_the_real_world_comes_nearer_to_it(residual):
+    sim, tau = world("InvertedPendulum-v4"), real_data("InvertedPendulum-v4", 30)
+    model = RealModel(sim, residual)
+    held_out = model.fit(tau, seed=0)
+    sim.reset(seed=0)
+    miss, miss_without = [], []
+    real = world("InvertedPendulum-v4", real=True)
+    rng = np.random.default_rng(0)
+    real.reset(seed=0)
+    for _ in range(4):
+        sim.batch.state[:] = real.batch.state
+        s, a = sim.observe(), rng.uniform(-1, 1, (4, 1)).astype(np.float32)
+        predicted, guess = model(s, a)
+        truth = real.step(a)[4]["next_obs"]
+        miss.append(((predicted - truth) ** 2).sum(1)), miss_without.append(((sim.peek(a) - truth) ** 2).sum(1))
+        np.testing.assert_array_equal(guess, sim.peek(a).astype(np.float32) if residual else s.astype(np.float32))
+    assert 0 < held_out < 0.5
+    assert np.mean(miss) < 0.3 * np.mean(miss_without)
+
+
+def test_a_state_not_seen_in_full_keeps_the_sims_word():
+    sim, tau = world("Hopper-v4"), real_data("Hopper-v4")
+    model = RealModel(sim, residual=True)
+    model.fit(tau, seed=0)
+    obs, _ = sim.reset(seed=0)
+    sim.qvel[1, 3] = 12.0  # observed as 10
+    predicted, guess = model(sim.observe(), np.zeros((4, 3)))
+    np.testing.assert_array_equal(predicted[1], guess[1])
+    assert not np.array_equal(predicted[0], guess[0])
+    np.testing.assert_array_equal(measured(sim, sim.observe()), [True, False, True, True])
+
+
+def test_predict_all_goes_through_a_ragged_number_of_rows():
+    sim, tau = world("InvertedPendulum-v4"), real_data("InvertedPendulum-v4")[:11]
+    after = predict_all(sim, tau)
+    assert after.shape == tau.s.shape
+    one = world("InvertedPendulum-v4", n=1)
+    for k in range(11):
+        np.testing.assert_allclose(after[k], one.predict(tau.s[k : k + 1].astype(float), tau.a[k : k + 1])[0], atol=1e-6)
+
+
+# --- the methods --------------------------------------------------------------------------------------
+
+
+def test_no_grounding_is_the_raw_sim():
+    grounding = Grounding(world("Hopper-v4"))
+    assert grounding.transformer is identity and grounding.fit(None, None, 0) == grounding.update(None, 10, 0) == {}
+
+
+def test_ane_adds_noise_of_the_asked_width_to_actions():
+    grounding = ANE(world("InvertedPendulum-v4"), replace(SMALL, ane_width=0.1))
+    grounding.update(None, 0, seed=0)
+    noise = grounding.transformer(None, np.zeros((20_000, 1)))
+    assert abs(noise.std() - 0.1 * 3) < 0.01 and abs(noise.mean()) < 0.01
+    assert np.abs(grounding.transformer(None, np.full((1000, 1), 3.0))).max() <= 3
+
+
+def test_gat_smooths_the_inverse_models_action():
+    sim, tau = world("InvertedPendulum-v4"), real_data("InvertedPendulum-v4", 30)
+    policy = policy_for(sim)
+    grounding = GAT(sim, SMALL)
+    assert 0 < grounding.fit(tau, policy, 0)["forward_model_error"] < 1
+    assert grounding.update(policy, 400, 0)["sim_transitions"] >= min(400, len(tau))
+    obs, _ = sim.reset(seed=1)
+    a = np.array([[-1.0], [0.5], [0.0], [2.0]])
+    with torch.no_grad():
+        s_next = torch.from_numpy(grounding.real_model(obs, a)[0])
+        inverse = grounding.inverse_model(torch.from_numpy(obs.astype(np.float32)), s_next).numpy()
+    expected = np.clip(0.95 * inverse + 0.05 * a, -3, 3)
+    np.testing.assert_allclose(grounding.transformer(obs, a), expected, atol=1e-6)
+    other = GAT(world("InvertedPendulum-v4"), SMALL)
+    other.load(copy.deepcopy(grounding.state()))
+    other.sim.reset(seed=1)
+    np.testing.assert_allclose(other.transformer(obs, a), expected, atol=1e-6)
+
+
+def test_rgat_learns_repeats_and_reloads():
+    tau, results = real_data("InvertedPendulum-v4", 30), []
+    for _ in range(2):
+        sim = world("InvertedPendulum-v4")
+        grounding, policy = RGAT(sim, SMALL), policy_for(sim)
+        fitted, rows = grounding.fit(tau, policy, 0), []
+        learnt = grounding.update(policy, 256, 0, rows.append)
+        results.append((fitted, learnt, [p.detach().clone() for p in grounding.learner.policy.parameters()]))
+    assert results[0][:2] == results[1][:2] and len(rows) == 4
+    assert all(torch.equal(a, b) for a, b in zip(results[0][2], results[1][2]))
+    assert 0 < learnt["kl"] <= SMALL.at.max_kl and 0 < learnt["at_std"]
+    obs, _ = sim.reset(seed=1)
+    a = np.zeros((4, 1))
+    assert np.abs(grounding.transformer(obs, a) - a).max() > 0
+    other = RGAT(world("InvertedPendulum-v4"), SMALL)
+    other.load(copy.deepcopy(grounding.state()))
+    np.testing.assert_array_equal(other.transformer(obs, a), grounding.transformer(obs, a))
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v4", "Hopper-v4", "HalfCheetah-v4"])
+def test_the_oracle_is_never_worse_than_the_identity(env_id):
+    sim, real = world(env_id), world(env_id, real=True)
+    oracle = Oracle(sim, SMALL, real.model)
+    obs, _ = sim.reset(seed=2)
+    box, rng = sim.single_action_space, np.random.default_rng(0)
+    better = []
+    for _ in range(25):
+        a = rng.uniform(box.low, box.high, sim.action_space.shape)
+        state = sim.batch.state.copy()
+        a_hat = oracle.transformer(obs, a)
+        np.testing.assert_array_equal(sim.batch.state, state)  # it looked, and moved nothing
+        assert (a_hat >= box.low).all() and (a_hat <= box.high).all()
+        real.batch.state[:] = state
+        truth = real.peek(a)
+        error = lambda u: ((sim.peek(u) - truth) ** 2).sum(1)
+        assert (error(a_hat) <= error(a) * (1 + 1e-9) + 1e-12).all()
+        better.append(error(a_hat).mean() / error(a).mean())
+        obs = sim.step(a, applied=a_hat)[0]
+    assert np.median(better) < 0.9
+
+
+def test_the_oracle_finds_the_best_action_of_the_pendulum():
+    sim, real = world("InvertedPendulum-v4"), world("InvertedPendulum-v4", real=True)
+    oracle = Oracle(sim, SMALL, real.model)
+    obs, _ = sim.reset(seed=0)
+    a = np.array([[-2.0], [-0.5], [0.7], [2.0]])
+    found = oracle.transformer(obs, a)
+    real.batch.state[:] = sim.batch.state
+    truth = real.peek(a)
+    error = lambda u: ((sim.peek(np.broadcast_to(u, (4, 1))) - truth) ** 2).sum(1)
+    grid = np.min([error(u) for u in np.linspace(-3, 3, 601)], axis=0)
+    assert (error(found) < grid + 1e-4).all()
+
+
+def test_one_step_errors_by_hand():
+    env_id = "InvertedPendulum-v4"
+    sim, one, tau = world(env_id), world(env_id, n=1), real_data(env_id)[:11]
+    halve = lambda obs, a: 0.5 * a
+    miss, change = [], []
+    for s, a, s_next in zip(tau.s.astype(float), tau.a.astype(float), tau.s_next.astype(float)):
+        miss.append(((one.predict(s[None], 0.5 * a[None])[0] - s_next) ** 2).sum())
+        change.append(((0.5 * a) ** 2).sum())
+    assert one_step_error(sim, halve, tau) == pytest.approx((np.sqrt(np.mean(miss)), np.sqrt(np.mean(change))), rel=1e-6)
+    assert one_step_error(sim, identity, tau)[1] == 0
+
+
+def test_one_step_error_is_naught_in_the_same_world():
+    sim = world("InvertedPendulum-v4")
+    tau = rollouts(policy_for(sim), sim, 4, seed=0)[1]
+    assert one_step_error(sim, identity, tau)[0] < 1e-5  # what float32 keeps of the states
+
+
+# --- strangers ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v4", "Hopper-v5"])
+def test_sb3_trains_in_the_grounded_sim(env_id):
+    pytest.importorskip("sb3_contrib")
+    from sb3_adapter import ActingPolicy, trpo_model
+
+    grounded = GroundedEnv(world(env_id), lambda obs, a: 0.8 * a)
+    model = trpo_model(grounded, TRPOConfig(batch_size=256, value_batch=64), seed=0)
+    before = [p.detach().clone() for p in model.policy.parameters()]
+    model.learn(600)
+    assert model.num_timesteps == 768
+    assert any(not torch.equal(a, b) for a, b in zip(before, model.policy.parameters()))
+    assert all(torch.isfinite(p).all() for p in model.policy.parameters())
+    returns = rollouts(ActingPolicy(model), world(env_id), 3, seed=0, deterministic=True)[0]
+    assert np.isfinite(returns).all() and (returns > 0).all()
+
+
+def test_sb3_is_told_falls_and_time_limits_apart(monkeypatch):
+    pytest.importorskip("stable_baselines3")
+    import envs
+    from sb3_adapter import SB3Env
+
+    monkeypatch.setattr(envs, "TIME_LIMIT", 12)
+    env, twin = SB3Env(world("Hopper-v4")), world("Hopper-v4")
+    env.seed(0), env.reset(), twin.reset(seed=0)
+    rng, kinds = np.random.default_rng(0), set()
+    for _ in range(60):
+        a = rng.uniform(-1, 1, (4, 3))
+        obs, reward, done, infos = env.step(a)
+        _, _, terminated, truncated, info = twin.step(a)
+        np.testing.assert_array_equal(done, terminated | truncated)
+        for i in np.flatnonzero(done):
+            np.testing.assert_array_equal(infos[i]["terminal_observation"], info["next_obs"][i])
+            assert infos[i]["TimeLimit.truncated"] == (truncated[i] and not terminated[i])
+            kinds.add(infos[i]["TimeLimit.truncated"])
+    assert kinds == {True, False}
