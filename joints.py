@@ -133,8 +133,8 @@ class NonlinearStiffness(JointNumber):
 class StribeckFriction(JointEffect):
     """Dry friction that falls from `static` at rest to `coulomb` when moving faster than `velocity`.
 
-    |F| = coulomb + (static − coulomb) exp(−(v/velocity)²): here as frictionloss `static`
-    and what it is too much once moving; in MJCF as the bristles of a LuGre model.
+    |F| = coulomb + (static − coulomb) exp(−(v/velocity)²): here as frictionloss `static` and
+    a force that gives back what it is too much once moving; in MJCF with LuGre bristles.
     """
     name, simplicity, related = 'stribeck_friction', 3, DISSIPATION
 
@@ -164,13 +164,16 @@ class StribeckFriction(JointEffect):
 
     def write(self, spec, model, i, values):
         # bristles as stiff as the time step can carry
-        joint, h = model.joint(i).name, spec.option.timestep
+        joint, h, (coulomb, static, velocity) = model.joint(i).name, spec.option.timestep, values
         M = 1 / model.dof_invweight0[model.jnt_dofadr[i]]  # what the joint feels, its neighbours free
+        # they carry what falls off and a share of the rest, frictionloss what is left
+        share = min((0.1 if runge_kutta(model) else 1e-3) * abs(static - coulomb), coulomb)
         stiffness, damping = 0.1 * M / h**2, 0.0
         if runge_kutta(model):  # also explodes where they relax within a step
-            stiffness = min(0.01 * M / h**2, values[0] / (h * max(3.0, 10 * values[2])))
+            stiffness = min(0.1 * stiffness, share / (h * max(3.0, 10 * velocity)))
             damping = np.sqrt(stiffness * M)
-        lugre = [stiffness, damping, *values]
+        CoulombFriction().write(spec, model, i, (coulomb - share,))
+        lugre = [stiffness, damping, share, static - coulomb + share, velocity]
         passive(spec, f'stribeck_friction:{joint}', JOINT_TRANSMISSION, joint, lugre=lugre)
         return 'mjcf'
 

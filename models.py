@@ -173,7 +173,7 @@ class Regressor(nn.Module):
         has not improved for `patience` epochs.
 
         Args: x (N, n_in), y (N, n_out) float32 tensors; generator: the split and the batches are drawn from it.
-        Returns: the root mean squared error on the held-out rows, in units of y. Keeps the best epoch's weights.
+        Returns: the RMS error of each output on the held-out rows, (n_out,). Keeps the best epoch's weights.
         """
         order = torch.randperm(len(x), generator=generator)
         held, train = order[: max(1, len(x) // 5)], order[max(1, len(x) // 5) :]
@@ -198,7 +198,7 @@ class Regressor(nn.Module):
                 break
         self.net.load_state_dict(best_state)
         with torch.no_grad():
-            return float(((self.outputs.std * (self.net(x[held]) - target[held])) ** 2).sum(-1).mean().sqrt())
+            return (((self.outputs.std * (self.net(x[held]) - target[held])) ** 2).mean(0).sqrt()).numpy()
 
 
 class ForwardModel(Regressor):
@@ -217,7 +217,7 @@ class ForwardModel(Regressor):
         return guess + super().forward(torch.cat((s, a, guess - s), -1))
 
     def fit(self, s, a, s_next, guess, generator, **settings):
-        """Fit to transitions and guesses, all (N, ...). Returns the held-out RMS of ||s' - f(s, a)||."""
+        """Fit to transitions and guesses, all (N, ...). Returns the held-out RMS error of each dimension of s'."""
         return super().fit(torch.cat((s, a, guess - s), -1), s_next - guess, generator, **settings)
 
 
@@ -231,5 +231,5 @@ class InverseModel(Regressor):
         return super().forward(torch.cat((s, s_next - s), -1))
 
     def fit(self, s, s_next, a, generator, **settings):
-        """Fit to transitions (N, nobs), (N, nobs), (N, nact). Returns the held-out RMS of the action's error."""
+        """Fit to transitions (N, nobs), (N, nobs), (N, nact). Returns the held-out RMS error of each action."""
         return super().fit(torch.cat((s, s_next - s), -1), a, generator, **settings)

@@ -23,7 +23,7 @@ from models import ForwardModel, GaussianPolicy, InverseModel, Value
 from trpo import TRPO, TRPOConfig, rollouts
 
 # section IV-D: the action transformer's own trust region, entropy and discount
-AT_CONFIG = TRPOConfig(batch_size=1024, max_kl=1e-3, entropy=1e-5, gamma=0.0)
+AT_CONFIG = TRPOConfig(batch_size=1024, max_kl=1e-2, entropy=1e-5, gamma=0.0)
 
 
 def identity(obs, action):
@@ -53,7 +53,7 @@ class RealModel:
         self.net = ForwardModel(sim.single_observation_space.shape[0], sim.single_action_space.shape[0])
 
     def fit(self, tau_real, seed):
-        """Fit to real Transitions, the sim started in each of their states. Returns the held-out RMS error."""
+        """Fit to real Transitions, the sim started in each of their states. Returns the held-out RMS error by dimension."""
         torch.manual_seed(seed)
         self.net = ForwardModel(*(space.shape[0] for space in (self.sim.single_observation_space, self.sim.single_action_space)))
         seen = tau_real if not self.residual else tau_real[measured(self.sim, tau_real.s)]
@@ -109,7 +109,9 @@ class ActionTransformerEnv(VectorEnv):
     """The grounding step as a reinforcement learning problem (paper, section III and Fig. 3b).
 
     The agent is g_phi: it observes (s, a), a ~ pi_theta(s), chooses delta_a, and is paid
-    R_AT = -||f_psi(s, a) - s'||^2. The target policy and the sim are its environment. R_AT is never positive,
+    R_AT = -||f_psi(s, a) - s'||^2, each dimension in units of `scale`: how much it changes in a real step. In raw
+    units the fast joints are all that counts, and what makes a robot fall, its slow root, is given up for them.
+    The target policy and the sim are g_phi's environment. R_AT is never positive,
     so an agent that could end episodes would learn to: the task's falls are handed out as truncations, which
     TRPO bootstraps like time limits. Where f_psi starts from the sim's own guess of s', the reward is counted
     from what a itself would have got, -||f_psi(s, a) - guess||^2: a baseline that g_phi does not influence.
@@ -117,8 +119,8 @@ class ActionTransformerEnv(VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, sim, transformer, policy, real_model, seed):
-        self.sim, self.transformer, self.policy, self.real_model = sim, transformer, policy, real_model
+    def __init__(self, sim, transformer, policy, real_model, scale, seed):
+        self.sim, self.transformer, self.policy, self.real_model, self.scale = sim, transformer, policy, real_model, scale
         self.num_envs = sim.num_envs
         nobs, nact = sim.single_observation_space.shape[0], sim.single_action_space.shape[0]
         self.single_observation_space = Box(-np.inf, np.inf, (nobs + nact,), np.float32)
@@ -140,10 +142,9 @@ class ActionTransformerEnv(VectorEnv):
     def step(self, output):
         s, a = np.split(self.sa, [self.sim.single_observation_space.shape[0]], axis=1)
         predicted, guess = self.real_model(s, a)
+        distance = lambda s_next: (((predicted - s_next) / self.scale) ** 2).sum(axis=1)
         obs, _, terminated, truncated, info = self.sim.step(a, applied=self.transformer.apply(a, output))
-        reward = -((predicted - info["next_obs"]) ** 2).sum(axis=1)
-        if self.real_model.residual:
-            reward += ((predicted - guess) ** 2).sum(axis=1)
+        reward = -distance(info["next_obs"]) + (distance(guess) if self.real_model.residual else 0.0)
         next_sa = self._with_action(info["next_obs"])
         done = terminated | truncated
         self.sa = next_sa.copy()
@@ -160,7 +161,7 @@ class GroundingSettings:
     """What the grounding methods can be told; defaults are the paper's where it gives them."""
 
     at: TRPOConfig = AT_CONFIG  # rgat: TRPO for the action transformer
-    at_std: float = 0.005  # rgat: its initial standard deviation, in units of the action range
+    at_std: float = 0.01  # rgat: its initial standard deviation, in units of the action range
     residual: bool = True  # rgat and gat: f_psi corrects the sim's own prediction
     smoothing: float = 0.95  # gat: a_hat = smoothing * g(s, a) + (1 - smoothing) * a
     ane_width: float = 0.2  # ane: standard deviation of the action noise, in units of half the action range
@@ -177,10 +178,17 @@ class Grounding:
         self.low, self.high = sim.single_action_space.low, sim.single_action_space.high
         self.nobs, self.nact = sim.single_observation_space.shape[0], sim.single_action_space.shape[0]
         self.transformer = identity
+        self.scale = np.ones(self.nobs, np.float32)
 
     def fit(self, tau_real, policy, seed):
         """Line 3: learn a model of the real dynamics. Returns statistics for progress.csv."""
         return {}
+
+    def _measure_scale(self, tau_real):
+        """The unit of each dimension of R_AT, from the first real data: later, a robot that stands still would
+        make it vanishingly small."""
+        if (self.scale == 1).all():
+            self.scale = step_size(tau_real)
 
     def update(self, policy, steps, seed, on_update=None):
         """Line 4: renew self.transformer with up to `steps` transitions in the sim. Returns statistics."""
@@ -206,7 +214,8 @@ class RGAT(Grounding):
 
     def fit(self, tau_real, policy, seed):
         self.seen = tau_real
-        return {"forward_model_error": self.real_model.fit(tau_real, seed)}
+        self._measure_scale(tau_real)
+        return {"forward_model_error": relative(self.real_model.fit(tau_real, seed), tau_real)}
 
     def update(self, policy, steps, seed, on_update=None):
         """g_phi goes on from the last grounding step, as Algorithm 1 has it: at max KL 1e-4 one step's updates are few."""
@@ -219,7 +228,7 @@ class RGAT(Grounding):
         # exploration is renewed: with what TRPO leaves of it, a trust region would hold g_phi where it is
         with torch.no_grad():
             self.learner.policy.log_std.fill_(np.log(self.settings.at_std))
-        env = ActionTransformerEnv(self.sim, self.transformer, policy, self.real_model, seed)
+        env = ActionTransformerEnv(self.sim, self.transformer, policy, self.real_model, self.scale, seed)
         kls = []
         self.learner.learn(env, steps, seed, on_update=lambda stats: (kls.append(stats["kl"]), on_update and on_update(stats)))
         std = self.learner.policy.log_std.detach().exp().numpy() * (self.high - self.low)
@@ -231,10 +240,12 @@ class RGAT(Grounding):
         self.transformer = ActionTransformer(policy, self.low, self.high)
 
     def state(self):
-        return {"at": self.learner.state(), "forward_model": self.real_model.net.state_dict()}
+        scale = torch.from_numpy(self.scale)
+        return {"at": self.learner.state(), "forward_model": self.real_model.net.state_dict(), "scale": scale}
 
     def load(self, state):
         self.learner.load(state["at"])
+        self.scale = state["scale"].numpy()
         self.real_model.net.load_state_dict(state["forward_model"])
 
 
@@ -250,7 +261,7 @@ class GAT(Grounding):
 
     def fit(self, tau_real, policy, seed):
         self.seen = tau_real
-        return {"forward_model_error": self.real_model.fit(tau_real, seed)}
+        return {"forward_model_error": relative(self.real_model.fit(tau_real, seed), tau_real)}
 
     def update(self, policy, steps, seed, on_update=None):
         """f_sim^-1 from as many transitions in the sim as the real data holds, but at least `steps` of them."""
@@ -298,11 +309,12 @@ class ANE(Grounding):
 class Oracle(Grounding):
     """The ceiling of action transformation: the delta_a that best imitates the true real model, step by step.
 
-    A Gauss-Newton step on ||s'_sim(a_hat) - s'_real(a)||^2, whole, halved or not at all, whichever lands
+    A Gauss-Newton step on ||s'_sim(a_hat) - s'_real(a)||^2, in the units of R_AT, whole, halved or not at all, whichever lands
     nearest; derivatives by finite differences in a batch, from the sim's full state. It knows the real model,
     which no method may: it tells what a perfect g_phi could do.
     """
 
+    learns_from_real = True  # the units alone
     epsilon = 0.05  # finite difference, in units of the action range
 
     def __init__(self, sim, settings=GroundingSettings(), real_model=None):
@@ -313,13 +325,23 @@ class Oracle(Grounding):
         self.trial = Batch(sim.model, sim.num_envs * 2, nthread)
         self.transformer = self._transform
 
+    def fit(self, tau_real, policy, seed):
+        self._measure_scale(tau_real)
+        return {}
+
+    def state(self):
+        return {"scale": torch.from_numpy(self.scale)}
+
+    def load(self, state):
+        self.scale = state["scale"].numpy()
+
     def _after(self, batch, actions):
-        """Observations (n, k, nobs) one step after the sim's present states under actions (n, k, nact)."""
+        """Observations (n, k, nobs), in units of scale, one step after the sim's present states under actions (n, k, nact)."""
         n, k, _ = actions.shape
         batch.state[:] = np.repeat(self.sim.batch.state, k, axis=0)
         batch.ctrl = actions.reshape(n * k, -1)
         batch.step(nstep=self.sim.task.frame_skip)
-        return self.sim.task.observe(batch.qpos, batch.qvel).reshape(n, k, -1)
+        return self.sim.task.observe(batch.qpos, batch.qvel).reshape(n, k, -1) / self.scale
 
     def _transform(self, obs, action):
         span = self.high - self.low
@@ -342,11 +364,21 @@ class Oracle(Grounding):
 METHODS = {"rgat": RGAT, "gat": GAT, "ane": ANE, "oracle": Oracle, "sim": Grounding, "real": Grounding}
 
 
+def step_size(transitions):
+    """How much each dimension of s changes in a step: its RMS, (nobs,) float32."""
+    return np.sqrt(((transitions.s_next - transitions.s) ** 2).mean(axis=0)) + 1e-6
+
+
+def relative(rms_error, transitions):
+    """RMS errors by dimension (nobs,) as one number, each in units of the dimension's step: 1 is no better than s' = s."""
+    return float(np.sqrt(((rms_error / step_size(transitions)) ** 2).mean()))
+
+
 def one_step_error(env, transformer, transitions, limit=4096):
     """How far the sim under a transformer lands from where the real world did.
 
-    Returns (RMS of ||s'_real - s'_sim||, RMS of ||a_hat - a||) over up to `limit` real transitions. Rows whose
-    velocities the observation clipped are left out: their state is not known.
+    Returns (error relative to the real step, RMS of ||a_hat - a||) over up to `limit` real transitions. Rows
+    whose velocities the observation clipped are left out: their state is not known.
     """
     rows = np.flatnonzero(measured(env, transitions.s))
     rows = rows[np.linspace(0, len(rows) - 1, min(limit, len(rows))).astype(int)]
@@ -356,6 +388,6 @@ def one_step_error(env, transformer, transitions, limit=4096):
         s, a, s_next = (x[fill].astype(float) for x in (transitions.s, transitions.a, transitions.s_next))
         a_hat = []
         after = env.predict(s, lambda obs: a_hat.append(transformer(obs, a)) or a_hat[0])
-        miss.append(((after - s_next) ** 2).sum(axis=1)[: len(part)])
+        miss.append((after - s_next)[: len(part)] ** 2)
         change.append(((a_hat[0] - a) ** 2).sum(axis=1)[: len(part)])
-    return tuple(float(np.sqrt(np.concatenate(x).mean())) for x in (miss, change))
+    return relative(np.sqrt(np.concatenate(miss).mean(axis=0)), transitions[rows]), float(np.sqrt(np.concatenate(change).mean()))

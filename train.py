@@ -29,8 +29,8 @@ from trpo import PRESETS, TRPO, Transitions, rollouts
 # settings that suit each task, where the command line does not say
 DEFAULTS = {
     "InvertedPendulum": {"pretrain_steps": 150_000, "grounding_steps": 10, "at_steps": 100_000, "policy_steps": 100_000, "at_std": 0.05},
-    "Hopper": {"pretrain_steps": 1_000_000, "grounding_steps": 10, "at_steps": 200_000, "policy_steps": 250_000, "at_std": 0.005},
-    "HalfCheetah": {"pretrain_steps": 1_000_000, "grounding_steps": 20, "at_steps": 200_000, "policy_steps": 250_000, "at_std": 0.005},
+    "Hopper": {"pretrain_steps": 1_000_000, "grounding_steps": 10, "at_steps": 200_000, "policy_steps": 250_000, "at_std": 0.01},
+    "HalfCheetah": {"pretrain_steps": 1_000_000, "grounding_steps": 20, "at_steps": 200_000, "policy_steps": 250_000, "at_std": 0.01},
 }
 
 

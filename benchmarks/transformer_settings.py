@@ -26,14 +26,15 @@ from trpo import rollouts  # noqa: E402
 CSV = ROOT / "results" / "transformer_settings.csv"
 WIDE, NARROW = 0.14, None  # None: the task's default
 VARIANTS = [  # at_gamma, at_max_kl, at_std, forward_model
+    (0.0, 1e-2, NARROW, "residual"),
     (0.0, 1e-3, NARROW, "residual"),
     (0.0, 1e-4, NARROW, "residual"),
-    (0.9, 1e-3, NARROW, "residual"),
-    (0.99, 1e-3, NARROW, "residual"),
+    (0.9, 1e-2, NARROW, "residual"),
+    (0.99, 1e-2, NARROW, "residual"),
     (0.99, 1e-4, NARROW, "residual"),
-    (0.0, 1e-3, WIDE, "residual"),
+    (0.0, 1e-2, WIDE, "residual"),
     (0.99, 1e-4, WIDE, "residual"),
-    (0.0, 1e-3, NARROW, "plain"),
+    (0.0, 1e-2, NARROW, "plain"),
     (0.99, 1e-4, WIDE, "plain"),
 ]
 

@@ -1,0 +1,411 @@
+"""The command: every algorithm end to end, a run cut off anywhere and resumed, bad input, replay."""
+import csv
+import errno
+import json
+import os
+import resource
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+sys.path.insert(0, ROOT)
+import runs
+import train
+import trpo
+from envs import BatchEnv
+from models import GaussianPolicy
+from rgat import METHODS
+
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+ENV = "InvertedPendulum-v4"
+TINY = (
+    "--pretrain-steps 2048 --grounding-steps 2 --at-steps 1024 --policy-steps 2048 --real-trajectories 4 "
+    "--eval-episodes 2 --num-envs 4 --threads 1 --seed 3"
+).split()
+PROGRESS = (
+    "grounding_step,real_transitions,sim_steps,real_return_deterministic,real_return_deterministic_se,"
+    "real_return_stochastic,forward_model_error,at_one_step_error,identity_one_step_error,delta_action_rms,at_std,kl,seconds"
+)
+
+
+def command(out, algo="rgat", env=ENV, *more):
+    return ["--env", env, "--algo", algo, "--out", str(out), *TINY, *more]
+
+
+def table(path):
+    return list(csv.DictReader(path.open(newline="")))
+
+
+def contents(folder):
+    """Every file below a folder, by name, as bytes."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file()}
+
+
+def tensors(saved, prefix=""):
+    """A checkpoint's leaves by path."""
+    if isinstance(saved, dict):
+        return {k: v for key in saved for k, v in tensors(saved[key], f"{prefix}/{key}").items()}
+    if isinstance(saved, (list, tuple)):
+        return {k: v for i, x in enumerate(saved) for k, v in tensors(x, f"{prefix}/{i}").items()}
+    return {prefix: saved}
+
+
+def assert_same_run(ours, theirs):
+    """Two run folders hold the same numbers, but for the seconds."""
+    drop = lambda rows: [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
+    assert drop(table(ours / "progress.csv")) == drop(table(theirs / "progress.csv"))
+    assert (ours / "train.csv").read_bytes() == (theirs / "train.csv").read_bytes()
+    for name in ("lines.json", "best.json"):
+        assert json.loads((ours / name).read_text()) == json.loads((theirs / name).read_text())
+    names = sorted(p.name for p in theirs.glob("*.pt"))
+    assert names == sorted(p.name for p in ours.glob("*.pt"))
+    for name in names:
+        a, b = (tensors(torch.load(f / name, weights_only=True)) for f in (ours, theirs))
+        assert a.keys() == b.keys()
+        for key in a:
+            assert torch.equal(a[key], b[key]) if torch.is_tensor(a[key]) else a[key] == b[key], (name, key)
+    for path in theirs.glob("real_*.npz"):
+        with np.load(path) as a, np.load(ours / path.name) as b:
+            assert all(np.array_equal(a[k], b[k]) for k in ("s", "a", "s_next"))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """finished(algo): the folder of an undisturbed run, made once."""
+    folders = {}
+
+    def make(algo):
+        if algo not in folders:
+            folder = tmp_path_factory.mktemp("runs") / algo
+            assert train.main(command(folder, algo)) == 0
+            folders[algo] = folder
+        return folders[algo]
+
+    return make
+
+
+# --- end to end ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algo", list(METHODS))
+def test_every_algorithm_runs_end_to_end(algo, finished):
+    folder = finished(algo)
+    assert (folder / "progress.csv").read_text().splitlines()[0] == PROGRESS
+    rows = table(folder / "progress.csv")
+    assert [int(r["grounding_step"]) for r in rows] == [0, 1, 2]
+    for row in rows:
+        assert float(row["real_return_deterministic"]) > 0 and float(row["real_return_stochastic"]) > 0
+    for row in rows[1:]:
+        assert float(row["identity_one_step_error"]) > 0 and float(row["at_one_step_error"]) > 0
+    real, sim = ([int(r[k]) for r in rows] for k in ("real_transitions", "sim_steps"))
+    if algo in ("rgat", "gat"):
+        assert 0 == real[0] < real[1] < real[2]
+        for step in (1, 2):
+            with np.load(folder / f"real_{step:02d}.npz") as data:
+                assert len(data["s"]) == real[step] - real[step - 1]
+    expected = {"rgat": 2048 + 1024, "gat": None, "real": 0}.get(algo, 2048)
+    if expected is not None:
+        assert [b - a for a, b in zip(sim, sim[1:])] == [expected] * 2
+    assert (real if algo == "real" else sim)[0] == 2048
+    config = json.loads((folder / "config.json").read_text())
+    assert config["settings"]["algo"] == algo and config["settings"]["real"] == "pole:mass=100"
+    assert len({r["phase"] for r in table(folder / "train.csv")}) >= 2
+    for step in range(3):
+        assert torch.load(folder / f"step_{step:02d}.pt", weights_only=True)
+    with Image.open(folder / "progress.png") as image:
+        assert image.format == "PNG" and image.width > 600
+    assert not list(folder.glob(".*"))  # no half-written files
+    lines = json.loads((folder / "lines.json").read_text())
+    assert set(lines) == ({"trained on real"} if algo == "real" else {"trained in sim", "trained on real"})
+    policy = GaussianPolicy.load(folder / "policy.pt")
+    assert policy.sizes == (4, 64, 64, 1)
+
+
+def test_step_0_is_the_untouched_sim_policy_and_the_saved_policy_the_best(finished):
+    folder = finished("rgat")
+    rows = table(folder / "progress.csv")
+    start = torch.load(folder / "step_00.pt", weights_only=True)
+    sim = train.Settings(env=ENV, seed=3, num_envs=4).completed()
+    learner = train.new_learner(sim)
+    learner.learn(BatchEnv(ENV, 4), 2048, train.seed_for(3, 0, "pretrain"), freeze_normalizer=False)
+    assert all(torch.equal(v, start["learner"]["policy"][k]) for k, v in learner.policy.state_dict().items())
+    best = int(np.argmax([float(r["real_return_deterministic"]) for r in rows]))
+    acting = torch.load(folder / f"step_{best:02d}.pt", weights_only=True)["acting"]
+    policy = torch.load(folder / "policy.pt", weights_only=True)
+    assert all(torch.equal(v, policy["state"][k]) for k, v in acting["state"].items())
+    verdict = json.loads((folder / "best.json").read_text())
+    assert verdict["grounding_step"] == best and verdict["episodes"] == 4
+
+
+@pytest.mark.parametrize("env", ["Hopper-v4", "HalfCheetah-v5"])
+def test_the_other_robots_and_the_shallow_policy(env, tmp_path):
+    more = ["--policy", "shallow", "--grounding-steps", "1", "--pretrain-steps", "0", "--policy-steps", "1", "--eval-episodes", "1"]
+    if env.startswith("HalfCheetah"):
+        more += ["--real-trajectories", "1"]
+    assert train.main(command(tmp_path / "run", "rgat", env, *more)) == 0
+    assert len(table(tmp_path / "run" / "progress.csv")) == 2
+    assert GaussianPolicy.load(tmp_path / "run" / "policy.pt").sizes[1:-1] == (4,)
+
+
+def test_pretrained_policies_are_shared(tmp_path, monkeypatch, finished):
+    shared = ["--pretrained", str(tmp_path / "shared")]
+    assert train.main(command(tmp_path / "a", "sim", ENV, *shared)) == 0
+    assert len(list((tmp_path / "shared").glob("*.pt"))) == 2
+    phases = []
+    phase = train.Bar.phase
+    monkeypatch.setattr(train.Bar, "phase", lambda self, step, name: phases.append(name) or phase(self, step, name))
+    assert train.main(command(tmp_path / "b", "ane", ENV, *shared)) == 0
+    assert "pretrain" not in phases and "reference" not in phases
+    first = lambda folder: {k: v for k, v in table(folder / "progress.csv")[0].items() if k != "seconds"}
+    assert first(tmp_path / "a") == first(tmp_path / "b") == first(finished("sim"))
+
+
+# --- cut off and resumed ------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """A kill: nothing in the program may catch it."""
+
+
+def cut_off_at(monkeypatch, owner, name, count, error):
+    """Make the count-th call of owner.name raise instead."""
+    original, calls = getattr(owner, name), []
+
+    def wrapped(*args, **kwargs):
+        calls.append(name)
+        if len(calls) == count:
+            raise error
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, wrapped)
+
+
+# TRPO updates of the rgat run: 1 pretraining, 2 reference, 3 transformer and 4 policy of step 1, 5 and 6 of step 2
+@pytest.mark.parametrize("algo, update", [("rgat", k) for k in range(1, 7)] + [("gat", 4), ("ane", 4), ("oracle", 4), ("real", 3)])
+def test_resume_equals_no_interruption(algo, update, tmp_path, finished, monkeypatch):
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        cut_off_at(patch, trpo.TRPO, "update", update, KeyboardInterrupt())
+        assert train.main(command(folder, algo)) == 130
+    assert not (folder / "best.json").exists()
+    kept = contents(folder)
+    assert train.main(["--resume", str(folder)]) == 0
+    assert_same_run(folder, finished(algo))
+    steps = [name for name in kept if name.startswith(("step_", "real_"))]
+    assert all((folder / name).read_bytes() == kept[name] for name in steps)
+
+
+@pytest.mark.parametrize("write", [2, 4, 6, 9, 12, 14])
+def test_a_kill_while_writing_loses_nothing_that_was_whole(write, tmp_path, finished, monkeypatch):
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        cut_off_at(patch, runs.os, "replace", write, Killed())
+        train.main(command(folder))
+    assert train.main(["--resume", str(folder)]) == 0
+    assert_same_run(folder, finished("rgat"))
+
+
+def test_resuming_a_finished_run_changes_nothing(tmp_path, finished):
+    folder = tmp_path / "run"
+    shutil.copytree(finished("rgat"), folder)
+    before = contents(folder)
+    assert train.main(["--resume", str(folder)]) == 0
+    assert contents(folder) == before
+
+
+# --- bad input ----------------------------------------------------------------------------------------
+
+
+def refused(argv, capfd, *says):
+    """Exit status 2 and one line on stderr that says so."""
+    capfd.readouterr()
+    try:
+        status = train.main([str(a) for a in argv])
+    except SystemExit as leave:  # argparse's way
+        status = leave.code
+    err = capfd.readouterr().err
+    assert status == 2, err
+    lines = err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("train.py: "), err
+    for words in says:
+        assert words in lines[0], err
+
+
+BAD = {
+    "env": (["--env", "Walker2d-v4"], "Hopper-v4"),
+    "algo": (["--algo", "sac"], "rgat"),
+    "policy": (["--policy", "wide"], "deep"),
+    "no perturbation": (["--real", "torso"], "NAME:FIELD"),
+    "operator": (["--real", "pole:mass+1"], "NAME:FIELD"),
+    "value": (["--real", "pole:mass=heavy"], "pole:mass=heavy"),
+    "field": (["--real", "pole:colour=1"], "colour"),
+    "body": (["--real", "torso:mass*1.27"], "pole"),
+    "joint": (["--real", "knee:damping=1"], "hinge"),
+    "negative mass": (["--real", "pole:mass=-1"], "positive"),
+    "seed": (["--seed", "-1"], "--seed"),
+    "pretrain": (["--pretrain-steps", "-5"], "--pretrain-steps"),
+    "grounding": (["--grounding-steps", "-1"], "--grounding-steps"),
+    "trajectories": (["--real-trajectories", "0"], "--real-trajectories"),
+    "at steps": (["--at-steps", "-1"], "--at-steps"),
+    "policy steps": (["--policy-steps", "-1"], "--policy-steps"),
+    "episodes": (["--eval-episodes", "0"], "--eval-episodes"),
+    "envs": (["--num-envs", "0"], "--num-envs"),
+    "threads": (["--threads", "-2"], "--threads"),
+    "a word for a number": (["--num-envs", "many"], "num-envs"),
+    "kl": (["--at-max-kl", "0"], "--at-max-kl"),
+    "nan": (["--at-std", "nan"], "--at-std"),
+    "gamma": (["--at-gamma", "1"], "--at-gamma"),
+    "width": (["--ane-width", "-1"], "--ane-width"),
+    "option": (["--pole-mass", "100"], "--pole-mass"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_options(name, tmp_path, capfd):
+    options, says = BAD[name]
+    refused(command(tmp_path / "run", "rgat", ENV, *options), capfd, says)
+    assert not (tmp_path / "run").exists() or not any((tmp_path / "run").glob("step_*"))
+
+
+def test_out_that_cannot_be_used(tmp_path, capfd, finished):
+    (tmp_path / "file").write_text("mine")
+    refused(command(tmp_path / "file"), capfd, "file", "--out")
+    assert (tmp_path / "file").read_text() == "mine"
+    refused(command("/proc/run"), capfd, "/proc/run", "--out")
+    before = contents(finished("rgat"))
+    refused(command(finished("rgat")), capfd, "--resume")
+    assert contents(finished("rgat")) == before
+
+
+def test_out_without_space(tmp_path, capfd):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        status = train.main(command(tmp_path / "run"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    err = capfd.readouterr().err
+    assert status == 2 and len(err.splitlines()) == 1 and "cannot write" in err
+    assert contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize("write", [5, 11])
+def test_a_disk_that_fills_up_leaves_whole_steps(write, tmp_path, capfd, finished, monkeypatch):
+    folder, full = tmp_path / "run", OSError(errno.ENOSPC, "No space left on device")
+    with monkeypatch.context() as patch:
+        cut_off_at(patch, runs.os, "replace", write, full)
+        refused(command(folder), capfd, "No space left", "--out")
+    assert not list(folder.glob(".*"))
+    assert train.main(["--resume", str(folder)]) == 0
+    assert_same_run(folder, finished("rgat"))
+
+
+def break_run(folder, how):
+    step = folder / "step_02.pt"
+    if how == "no run":
+        shutil.rmtree(folder)
+    elif how == "config of something else":
+        (folder / "config.json").write_text('{"name": "web", "version": 2}')
+    elif how == "config with foreign settings":
+        (folder / "config.json").write_text('{"settings": {"env": "Hopper-v4", "learning_rate": 0.1}}')
+    elif how == "config with a word for a number":
+        config = json.loads((folder / "config.json").read_text())
+        config["settings"]["num_envs"] = "many"
+        (folder / "config.json").write_text(json.dumps(config))
+    elif how == "config cut short":
+        (folder / "config.json").write_text((folder / "config.json").read_text()[:40])
+    elif how == "table cut short":
+        (folder / "train.csv").write_text("grounding_step,phase\nx,policy\n")
+    elif how == "checkpoint missing":
+        step.unlink()
+    elif how == "checkpoint cut short":
+        step.write_bytes(step.read_bytes()[:1000])
+    elif how == "checkpoint of something else":
+        torch.save({"weights": torch.zeros(3)}, step)
+    elif how == "checkpoint of another robot":
+        saved = torch.load(step, weights_only=True)
+        saved["learner"]["policy"] = GaussianPolicy(11, 3).state_dict()
+        torch.save(saved, step)
+    elif how == "checkpoint that is a list":
+        torch.save([1, 2], step)
+    elif how == "real data missing":
+        (folder / "real_01.npz").unlink()
+    elif how == "real data broken":
+        (folder / "real_01.npz").write_bytes(b"PK\x03\x04 no archive")
+    elif how == "policy broken":
+        (folder / "policy.pt").write_bytes(b"not a policy")
+    elif how == "policy missing":
+        (folder / "policy.pt").unlink()
+
+
+BROKEN = (
+    "no run,config of something else,config with foreign settings,config with a word for a number,config cut short,table cut short,"
+    "checkpoint missing,checkpoint cut short,checkpoint of something else,checkpoint of another robot,checkpoint that is a list,"
+    "real data missing,real data broken,policy broken,policy missing"
+).split(",")
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_broken_or_foreign_run_is_refused_and_left_alone(how, tmp_path, capfd, finished):
+    folder = tmp_path / "run"
+    shutil.copytree(finished("rgat"), folder)
+    break_run(folder, how)
+    before = contents(tmp_path)
+    refused(["--resume", folder], capfd, str(folder))
+    if how in ("no run", "config of something else", "policy broken", "policy missing"):
+        refused(["--replay", folder], capfd, str(folder))
+    assert contents(tmp_path) == before
+
+
+def test_a_broken_shared_policy_is_named(tmp_path, capfd, finished):
+    shared = tmp_path / "shared"
+    options = ["--pretrained", str(shared), "--grounding-steps", "0"]
+    assert train.main(command(tmp_path / "a", "real", ENV, *options)) == 0
+    for path in shared.glob("*.pt"):
+        path.write_bytes(b"broken")
+    refused(command(tmp_path / "b", "real", ENV, *options), capfd, str(shared))
+    for path in shared.glob("*.pt"):
+        torch.save({"policy": {}}, path)
+    refused(command(tmp_path / "c", "real", ENV, *options), capfd, str(shared))
+
+
+def test_an_unstable_real_world_ends_in_one_line(tmp_path, capfd):
+    refused(command(tmp_path / "run", "rgat", ENV, "--real", "world:gravity=1e12"), capfd, "unstable", "--real")
+
+
+def test_help_has_a_line_for_each_setting(capsys):
+    with pytest.raises(SystemExit) as leave:
+        train.main(["--help"])
+    text = capsys.readouterr().out
+    assert leave.value.code == 0
+    for name in "env algo seed real policy pretrain-steps grounding-steps real-trajectories at-steps policy-steps eval-episodes num-envs out resume replay".split():
+        assert f"--{name} " in text
+
+
+# --- replay -------------------------------------------------------------------------------------------
+
+
+def test_replay_draws_sim_and_real_side_by_side(tmp_path, finished, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(finished("sim"), folder)
+    before = contents(folder)
+    assert train.main(["--replay", str(folder)]) == 0
+    with Image.open(folder / "replay.gif") as gif:
+        assert gif.format == "GIF" and gif.n_frames > 1
+        frames = []
+        for k in (0, gif.n_frames - 1):
+            gif.seek(k)
+            frames.append(np.asarray(gif.convert("RGB")).astype(int))
+        assert gif.width == 2 * 400
+    assert np.abs(frames[0] - frames[1]).max() > 50  # something moves
+    assert "sim" in capsys.readouterr().out
+    after = contents(folder)
+    after.pop("replay.gif")
+    assert after == before
