@@ -45,7 +45,7 @@ class TRPOConfig:
 PRESETS = {
     "InvertedPendulum": TRPOConfig(value_epochs=10),
     "Hopper": TRPOConfig(),
-    "HalfCheetah": TRPOConfig(),
+    "HalfCheetah": TRPOConfig(normalize_obs=True),
 }
 
 

@@ -3,7 +3,9 @@
     python benchmarks/transformer_settings.py --env Hopper-v4 --seeds 0
 
 Appends to results/transformer_settings.csv: the one-step error on held-out real transitions that a transformer
-leaves, beside the untransformed simulator's (identity) and the oracle's. Rows that exist are skipped.
+leaves, and the return that the same frozen policy gets in the grounded simulator: it should be the real one.
+Variants "sim", "real" and "oracle" are the raw worlds and the perfect transformer, "raw" is R_AT with its
+dimensions in SI units, not in those of a real step. Rows that exist are skipped.
 """
 
 import argparse
@@ -20,23 +22,28 @@ sys.path.insert(0, str(ROOT))
 import train  # noqa: E402
 from benchmarks.grounding import append, done  # noqa: E402
 from envs import BatchEnv, parse_perturbation  # noqa: E402
-from rgat import AT_CONFIG, METHODS, GroundingSettings, identity, one_step_error  # noqa: E402
+from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, one_step_error  # noqa: E402
 from trpo import rollouts  # noqa: E402
 
 CSV = ROOT / "results" / "transformer_settings.csv"
 WIDE, NARROW = 0.14, None  # None: the task's default
-VARIANTS = [  # at_gamma, at_max_kl, at_std, forward_model
-    (0.0, 1e-2, NARROW, "residual"),
-    (0.0, 1e-3, NARROW, "residual"),
-    (0.0, 1e-4, NARROW, "residual"),
-    (0.9, 1e-2, NARROW, "residual"),
-    (0.99, 1e-2, NARROW, "residual"),
-    (0.99, 1e-4, NARROW, "residual"),
-    (0.0, 1e-2, WIDE, "residual"),
-    (0.99, 1e-4, WIDE, "residual"),
-    (0.0, 1e-2, NARROW, "plain"),
-    (0.99, 1e-4, WIDE, "plain"),
+VARIANTS = [  # method, norm, at_gamma, at_max_kl, at_std, forward_model
+    ("sim", "", "", "", "", ""),
+    ("real", "", "", "", "", ""),
+    ("oracle", "step", "", "", "", ""),
+    ("oracle", "raw", "", "", "", ""),
+    ("rgat", "step", 0.0, 1e-2, NARROW, "residual"),
+    ("rgat", "raw", 0.0, 1e-2, NARROW, "residual"),
+    ("rgat", "step", 0.0, 1e-3, NARROW, "residual"),
+    ("rgat", "step", 0.0, 1e-4, NARROW, "residual"),
+    ("rgat", "step", 0.9, 1e-2, NARROW, "residual"),
+    ("rgat", "step", 0.99, 1e-2, NARROW, "residual"),
+    ("rgat", "step", 0.99, 1e-4, NARROW, "residual"),
+    ("rgat", "step", 0.0, 1e-2, WIDE, "residual"),
+    ("rgat", "step", 0.0, 1e-2, NARROW, "plain"),
+    ("rgat", "raw", 0.99, 1e-4, WIDE, "plain"),
 ]
+COLUMNS = ("method", "norm", "at_gamma", "at_max_kl", "at_std", "forward_model")
 
 
 def main():
@@ -47,27 +54,39 @@ def main():
     torch.set_num_threads(1)
     for seed in args.seeds:
         s = train.Settings(env=args.env, seed=seed, threads=1, pretrained=str(ROOT / "runs" / "pretrained")).completed()
-        todo = [dict(zip(("at_gamma", "at_max_kl", "at_std", "forward_model"), v)) for v in VARIANTS]
-        todo = [{**v, "at_std": v["at_std"] or s.at_std} for v in todo]
+        todo = [dict(zip(COLUMNS, values)) for values in VARIANTS]
+        todo = [{**v, "at_std": v["at_std"] or s.at_std} if v["method"] == "rgat" else v for v in todo]
         todo = [v for v in todo if not done(CSV, {"env": s.env, "seed": seed, **v})]
         if not todo:
             continue
         sim, real = BatchEnv(s.env, s.num_envs, nthread=1), BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=1)
         learner = train.new_learner(s)
         learner.load(train.pretrained(s, "sim", sim, Quiet()))
-        tau_real = rollouts(learner.policy, real, 50, seed + 1)[1]
-        held_out = rollouts(learner.policy, real, 20, seed + 1000)[1]
-        ends = {"identity_error": one_step_error(sim, identity, held_out)[0]}
-        ends["oracle_error"] = one_step_error(sim, METHODS["oracle"](sim, real_model=real.model).transformer, held_out)[0]
+        tau_real = rollouts(learner.policy, real, s.real_trajectories, seed + 1)[1]
+        held_out = rollouts(learner.policy, real, s.eval_episodes, seed + 1000)[1]
         for v in todo:
             began = time.monotonic()
-            at = dataclasses.replace(AT_CONFIG, max_kl=v["at_max_kl"], gamma=v["at_gamma"])
-            grounding = METHODS["rgat"](sim, GroundingSettings(at=at, at_std=v["at_std"], residual=v["forward_model"] == "residual"))
-            fit = grounding.fit(tau_real, learner.policy, seed)
-            grounding.update(learner.policy, s.at_steps, seed)
-            error, change = one_step_error(sim, grounding.transformer, held_out)
-            row = {"env": s.env, "seed": seed, **v, "at_steps": s.at_steps, **fit, "at_error": error, **ends, "delta_action_rms": change}
+            grounding, world, fit = ground(s, v, sim, real, learner.policy, tau_real, seed)
+            error, change = one_step_error(world, grounding.transformer, held_out)
+            returns = [rollouts(learner.policy, GroundedEnv(world, grounding.transformer), 64, seed, d)[0].mean() for d in (True, False)]
+            row = {"env": s.env, "seed": seed, **v, "at_steps": s.at_steps, "forward_model_error": "", **fit, "one_step_error": error}
+            row |= {"delta_action_rms": change, "return_deterministic": returns[0], "return_stochastic": returns[1]}
             append(CSV, [{**row, "seconds": round(time.monotonic() - began, 1)}])
+
+
+def ground(s, v, sim, real, policy, tau_real, seed):
+    """The grounding of one variant, the world that it acts in, and the statistics of its fit."""
+    method, world = METHODS[v["method"]], real if v["method"] == "real" else sim
+    settings = GroundingSettings()
+    if v["method"] == "rgat":
+        at = dataclasses.replace(AT_CONFIG, max_kl=v["at_max_kl"], gamma=v["at_gamma"])
+        settings = GroundingSettings(at=at, at_std=v["at_std"], residual=v["forward_model"] == "residual")
+    grounding = method(world, settings, real.model) if v["method"] == "oracle" else method(world, settings)
+    if v["norm"] == "raw":
+        grounding._measure_scale = lambda tau: None  # dimensions stay as they are
+    fit = grounding.fit(tau_real, policy, seed)
+    grounding.update(policy, s.at_steps, seed)
+    return grounding, world, fit
 
 
 class Quiet:
