@@ -1,0 +1,78 @@
+"""Diagnose the recordings of real machines and compare with what was published: results/real.csv.
+
+    python benchmarks/real.py [--recordings ../shared/recordings] [--only emps double_pendulum]
+
+Recordings are not part of this repository; what is absent is skipped. One row per finding.
+"""
+
+import argparse
+import csv
+import os
+from pathlib import Path
+import sys
+import time
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from diagnose import diagnose  # noqa: E402
+
+BALLS = ("bowlingball", "baseball", "golfball", "volleyball", "tennisball", "whiffleball_1", "whiffleball_2", "whiffleball_orange",
+         "whiffleball_yellow", "basketball_blue", "basketball_green")
+# rig, model, pattern of the recordings, what was published or is expected
+CASES = [("emps", "model.xml", "*", "viscous 203.5 N s/m, Coulomb 20.4 N, offset 3.16 N"),
+         ("emps", "model_viscous.xml", "*", "Coulomb 20.4 N, damping back to 203.5 N s/m, offset 3.16 N"),
+         ("double_pendulum", "model.xml", "*", "Coulomb 0.146 and 0.123 N m, armature 0.0036 kg m2"),
+         ("cube_toss", "model.xml", "*", "contact friction 0.18"),
+         ("arm_pendulum_single", "model.xml", "*", "viscous 2.24e-4 N m s/rad, or Coulomb 4.6e-4 N m with quadratic")]
+CASES += [("ball_drop", f"model_{b}.xml", b, "match" if b in BALLS[:3] else "quadratic damping or air drag") for b in BALLS]
+COLUMNS = ("rig", "model", "expected", "verdict", "effect", "place", "parameter", "value", "low", "high", "unit", "also_possible",
+           "held_out_before", "held_out_after", "held_out_floor", "channel", "unit_before", "unit_after", "seconds")
+
+
+def rows_of(folder, rig, model, pattern, expected):
+    train, held = (sorted(map(str, (folder / rig).glob(f"{kind}_{pattern}.csv"))) for kind in ("train", "heldout"))
+    if not train or not (folder / rig / model).exists():
+        print(f"{rig} {model}: not here, skipped")
+        return []
+    begun = time.monotonic()
+    summary = diagnose(folder / rig / model, train, held).summary
+    fit = summary["fit"]["held_out"]
+    channel, figures = next(iter(fit["channels"].items()))
+    common = {"rig": rig, "model": model, "expected": expected, "verdict": summary["verdict"], "held_out_before": fit["before"],
+              "held_out_after": fit["after"], "held_out_floor": fit["floor"], "channel": channel, "unit_before": figures["before"],
+              "unit_after": figures["after"], "seconds": round(time.monotonic() - begun, 1)}
+    out = []
+    for finding in summary["findings"]:
+        also = "; ".join(f"{a['effect']} {a['place']['name']}" for a in finding["also_possible"])
+        for parameter in finding["parameters"] or [{}]:
+            out.append({**common, "effect": finding["effect"], "place": finding["place"]["name"], "parameter": parameter.get("name"),
+                        **{k: parameter.get(k) for k in ("value", "low", "high", "unit")}, "also_possible": also})
+    return out or [common]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--recordings", type=Path, default=ROOT / ".." / "shared" / "recordings", help="folder of the rigs")
+    parser.add_argument("--only", nargs="*", help="rigs, or ball names, to do again; the other rows of the table stay")
+    parser.add_argument("--out", type=Path, default=ROOT / "results" / "real.csv")
+    options = parser.parse_args()
+    kept = list(csv.DictReader(options.out.open())) if options.only and options.out.exists() else []
+    for case in CASES:
+        if options.only and not {case[0], case[2]} & set(options.only):
+            continue
+        new = rows_of(options.recordings, *case)
+        kept = [r for r in kept if (r["rig"], r["model"]) != case[:2]] + new
+        for row in new:
+            print(*(row.get(k) for k in ("rig", "model", "verdict", "effect", "place", "value", "low", "high", "also_possible", "seconds")), flush=True)
+        options.out.parent.mkdir(exist_ok=True)
+        temporary = options.out.with_suffix(".tmp")
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in kept)
+        os.replace(temporary, options.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,208 @@
+"""The statistical method against closed forms, plain loops and stock MuJoCo; then whole diagnoses of a small pendulum."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import evidence
+import scores
+import shooting
+import windows as cut
+from identify import identify
+from recordings import Recording
+from world import World
+
+FREE = """<mujoco><worldbody><body><freejoint name="f"/><geom size=".1"/>
+  <body><joint name="b" type="ball"/><geom size=".1"/><body pos="0 0 1"><joint name="h"/><geom size=".1"/></body></body></body></worldbody></mujoco>"""
+PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="arm"><joint name="pivot" axis="0 1 0" damping="{damping}"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="{mass}" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><motor name="drive" joint="pivot"/></actuator></mujoco>"""
+NOISE = 5e-4
+
+
+def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=NOISE):
+    """A run of the pendulum in stock MuJoCo: sines and steps, position measured every 10 ms with noise.
+
+    push(time, qpos, qvel): torque that no catalogue knows of.
+    """
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(PENDULUM.format(damping=damping, mass=mass))
+    data = mujoco.MjData(model)
+    rows, period, phase = round(seconds / 0.01), rng.uniform(0.6, 1.2, 3), rng.uniform(0, 6, 3)
+    time = 0.01 * np.arange(rows)
+    ctrl = (0.2 * np.sin(2 * np.pi * time[:, None] / period + phase)).sum(1, keepdims=True)
+    qpos = np.empty((rows, 1))
+    data.qpos[:] = rng.uniform(-1, 1)
+    for t in range(rows):
+        qpos[t] = data.qpos
+        data.ctrl[:] = ctrl[t]
+        for _ in range(2):
+            data.qfrc_applied[:] = push(data.time, data.qpos[0], data.qvel[0]) if push else 0.0
+            mujoco.mj_step(model, data)
+    return Recording(name, time, qpos + noise * rng.normal(size=qpos.shape), np.full((rows, 1), np.nan), ctrl, {})
+
+
+def diagnosed(**hidden):
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded(f"run{i}.csv", i, **hidden) for i in range(3)]
+    return identify(world, runs[:2], runs[2:])
+
+
+def stock_error(xml, recording, noise):
+    """The reported error by a plain loop in stock MuJoCo."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, square, first = mujoco.MjData(model), [], 0
+    q, time = recording.qpos[:, 0], recording.time
+    while first + 30 < len(time):
+        mujoco.mj_resetData(model, data)
+        a, b = max(first - 1, 0), first + 1
+        data.qpos[:], data.qvel[:] = q[first], (q[b] - q[a]) / (time[b] - time[a])
+        for row in range(first, first + 30):
+            data.ctrl[:] = recording.ctrl[row]
+            mujoco.mj_step(model, data, round(0.01 / model.opt.timestep))
+            square.append((data.qpos[0] - q[row + 1]) ** 2)
+        first += 30
+    return np.sqrt(np.mean(square)) / noise
+
+
+# ---- coordinates, windows, error ---------------------------------------------------------------
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=50, deadline=None)
+def test_tangent_space_is_mujocos(seed):
+    rng, model = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(FREE)
+    start, step = np.zeros(model.nq), rng.normal(size=model.nv)
+    mujoco.mj_integratePos(model, (start := model.qpos0.copy()), rng.normal(size=model.nv), 1.0)
+    end, back = start.copy(), np.empty(model.nv)
+    mujoco.mj_integratePos(model, end, step, 1.0)
+    np.testing.assert_allclose(cut.integrate(model, start, step), end, atol=1e-12)
+    mujoco.mj_differentiatePos(model, back, 1.0, start, end)
+    np.testing.assert_allclose(cut.difference(model, start, end), back, atol=1e-9)
+
+
+@given(st.integers(2, 200), st.floats(0.003, 0.2), st.floats(0.0, 0.4), st.integers(0, 99))
+@settings(max_examples=60, deadline=None)
+def test_windows_tile_the_recording(rows, sample, jitter, seed):
+    time = sample * (np.arange(rows) + jitter * np.random.default_rng(seed).uniform(-1, 1, rows))
+    found = cut.consecutive(SimpleNamespace(time=time))
+    assert found[0].first == 0 and found[-1].last <= rows - 1
+    assert all(a.last == b.first for a, b in zip(found, found[1:]))
+    assert all(w.first < w.last for w in found)
+    if time[-1] - time[0] > 2 * cut.HORIZON:
+        assert all(time[w.last] - time[w.first] <= cut.HORIZON + 0.011 * np.median(np.diff(time)) + sample * (w.last == w.first + 1) for w in found)
+
+
+def test_error_is_that_of_stock_mujoco():
+    run = recorded("run.csv", 5, mass=0.7)
+    xml = PENDULUM.format(damping=0.05, mass=0.5)
+    world = World(mujoco.MjSpec.from_string(xml))
+    error, channels = evidence.prediction_error(world, {}, [run], np.array([NOISE]))
+    assert error == pytest.approx(stock_error(xml, run, NOISE), rel=1e-6)
+    assert channels["qpos:pivot"] == pytest.approx(error * NOISE, rel=1e-9)
+
+
+def test_noise_of_differences():
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(2000)
+    x = np.sin(3 * time) + 1e-3 * rng.normal(size=2000)
+    assert cut.difference_noise(x) == pytest.approx(1e-3, rel=0.1)
+
+
+def test_unmeasured_states_are_filled_from_velocity():
+    model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><joint type="slide"/><geom size=".1"/></body></worldbody></mujoco>')
+    time = 0.1 * np.arange(11)
+    recording = Recording("r", time, np.full((11, 1), np.nan), np.full((11, 1), 2.0), np.zeros((11, 0)), {})
+    qpos, qvel = cut.states(model, recording)
+    np.testing.assert_allclose(qpos[:, 0], 2.0 * time, atol=1e-12)
+    assert (qvel == 2.0).all()
+
+
+# ---- statistics --------------------------------------------------------------------------------
+
+
+@given(st.floats(0.01, 50), st.integers(1, 60))
+def test_f_tail_with_two_degrees_is_a_power(f, b):
+    assert scores.f_survival(f, 2, b) == pytest.approx((1 + 2 * f / b) ** (-b / 2), rel=1e-8)
+
+
+def test_t_quantile_of_one_degree_is_cauchys():
+    assert scores.t_quantile(1) == pytest.approx(np.tan(np.pi * 0.475), rel=1e-6)
+
+
+def test_p_values_hold_under_correlated_residuals():
+    rng, low = np.random.default_rng(1), []
+    for _ in range(400):
+        column = rng.normal(size=(24, 30, 1)) + rng.normal(size=(24, 1, 1))
+        residual = rng.normal(size=(24, 30)) + rng.normal(size=(24, 1))  # chi-square would reject half of these
+        low.append(scores.wald(np.einsum("cmk,cml->ckl", column, column), np.einsum("cmk,cm->ck", column, residual))[2] < 0.05)
+    assert 0.02 < np.mean(low) < 0.09
+
+
+# ---- shooting ----------------------------------------------------------------------------------
+
+
+def test_start_states_and_damping_are_recovered_without_noise():
+    run = recorded("run.csv", 2, damping=0.08, noise=0.0)
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    problem = shooting.Problem(world, cut.consecutive(run, 0.5), np.array([1e-4]), np.array([np.inf]))
+    nominal = shooting.fit_starts(problem, shooting.Hypothesis())
+    damping = world.candidate("viscous_damping", "pivot")
+    [fit] = shooting.solve(problem, [shooting.Hypothesis(((damping, (0.06,)),))], nominal, iterations=8)
+    assert fit.hypothesis.vector[0] == pytest.approx(0.08, rel=1e-3)
+    assert fit.chi2.sum() < 1e-3 * nominal.chi2.sum()
+
+
+# ---- whole diagnoses ---------------------------------------------------------------------------
+
+
+def names(diagnosis):
+    return [(f["effect"], f["place"]["name"]) for f in diagnosis.summary["findings"]]
+
+
+def test_nothing_missing_is_a_match():
+    diagnosis = diagnosed()
+    assert diagnosis.summary["verdict"] == "match" and not diagnosis.summary["findings"]
+    fit = diagnosis.summary["fit"]["held_out"]
+    assert fit["before"] == fit["after"] == pytest.approx(fit["floor"], rel=0.2)
+    assert diagnosis.summary["noise"]["qpos:pivot"] == pytest.approx(NOISE, rel=0.15)
+
+
+def test_damping_is_named_and_the_corrected_file_reproduces_the_error():
+    diagnosis = diagnosed(damping=0.1)
+    assert names(diagnosis) == [("viscous_damping", "pivot")]
+    [value] = diagnosis.summary["findings"][0]["parameters"]
+    assert value["low"] < 0.1 < value["high"] and value["value"] == pytest.approx(0.1, rel=0.02)
+    fit = diagnosis.summary["fit"]["held_out"]
+    assert fit["after"] < 0.5 * fit["before"] and fit["after"] == pytest.approx(fit["floor"], rel=0.3)
+    noise = diagnosis.summary["noise"]["qpos:pivot"]
+    assert stock_error(diagnosis.corrected_xml, diagnosis.held_out[0], noise) == pytest.approx(fit["after"], rel=1e-3)
+
+
+def test_two_effects_are_both_found():
+    diagnosis = diagnosed(damping=0.1, push=lambda time, q, v: 0.15)
+    found = [{(f["effect"], f["place"]["name"])} | {(a["effect"], a["place"]["name"]) for a in f["also_possible"]}
+             for f in diagnosis.summary["findings"]]
+    assert len(found) == 2
+    assert any(("viscous_damping", "pivot") in f for f in found) and any(("spring_offset", "pivot") in f for f in found)
+
+
+def test_what_no_catalogue_knows_is_called_unknown():
+    diagnosis = diagnosed(push=lambda time, q, v: -0.4 * np.sin(5 * q) * (q > 0))
+    found = [f for f in diagnosis.summary["findings"] if f["effect"] == "unknown"]
+    assert found and found[0]["place"]["name"] == "pivot" and "position:pivot" in found[0]["depends_on"]
+
+
+def test_a_push_for_a_while_is_placed_in_time():
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded("calm.csv", 0), recorded("pushed.csv", 1, push=lambda time, q, v: 0.5 * (1.5 < time < 2.5)), recorded("held.csv", 2)]
+    [finding] = identify(world, runs[:2], runs[2:]).summary["findings"]
+    assert finding["when"]["recording"] == "pushed.csv"
+    assert finding["when"]["time"] == pytest.approx([1.5, 2.5], abs=0.1)
+
+
+def test_the_same_input_gives_the_same_numbers():
+    first, second = diagnosed(), diagnosed()
+    assert first.summary == second.summary
