@@ -166,8 +166,11 @@ class StribeckFriction(JointEffect):
         # bristles as stiff as the time step can carry
         joint, h, (coulomb, static, velocity) = model.joint(i).name, spec.option.timestep, values
         M = 1 / model.dof_invweight0[model.jnt_dofadr[i]]  # what the joint feels, its neighbours free
+        if static == coulomb:
+            return CoulombFriction().write(spec, model, i, (coulomb,))
         # they carry what falls off and a share of the rest, frictionloss what is left
-        share = min((0.02 if runge_kutta(model) else 1e-3) * abs(static - coulomb), coulomb)
+        share = (0.05 if runge_kutta(model) else 1e-3) * (static - coulomb)
+        share = min(share, coulomb) if share > 0 else coulomb
         stiffness, damping = 0.1 * M / h**2, 0.0
         if runge_kutta(model):  # also explodes where they relax within a step
             stiffness = min(0.1 * stiffness, share / (h * max(3.0, 10 * velocity)))

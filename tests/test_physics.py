@@ -97,6 +97,20 @@ def test_stribeck_friction_in_mjcf_and_by_hand():
     assert abs(stock(corrected, world, recording, [0.0], [1.0], 100)[:, 0] - by_hand).max() < 0.02
 
 
+def test_stribeck_friction_that_does_not_fall_is_coulomb_friction():
+    world = pendulum()
+    stribeck, friction = world.candidate('stribeck_friction', 'j'), world.candidate('coulomb_friction', 'j')
+    for static in (0.1, 0.08):  # below coulomb, as a fit may have it: still a model that runs
+        xml, written = world.corrected_xml({stribeck: (0.1, static, 0.3)})
+        model = mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(model)
+        data.qvel[0] = 1.0
+        mujoco.mj_step(model, data, 300)
+        assert written == {stribeck: 'mjcf'} and np.isfinite(data.qpos).all() and abs(data.qvel[0]) < 1.0
+    xml = [world.corrected_xml({c: v})[0] for c, v in ((stribeck, (0.1, 0.1, 0.3)), (friction, (0.1,)))]
+    assert xml[0] == xml[1]
+
+
 def test_coulomb_friction_holds():
     """Below its limit the joint stands still: no creep, unlike MuJoCo's default friction."""
     world = pendulum()
