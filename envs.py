@@ -127,11 +127,12 @@ def parse_perturbation(text):
             name, field, op, value = match.groups()
             value = float(value)
         except (AttributeError, ValueError):
-            raise EnvError(f"cannot read {part!r}: write NAME:FIELD=VALUE or NAME:FIELD*FACTOR, e.g. torso:mass*1.27") from None
+            form = "NAME:FIELD=VALUE or NAME:FIELD*FACTOR, e.g. torso:mass*1.27"
+            raise EnvError(f"cannot read {part!r}: write {form}") from None
         if field not in FIELDS:
             raise EnvError(f"unknown field {field!r} in {part!r}: choose one of {', '.join(FIELDS)}")
         if not np.isfinite(value) or (field == "mass" and value <= 0) or (field in JOINT_FIELDS and value < 0):
-            raise EnvError(f"{part!r}: {value:g} is no possible {field}: give a finite {'positive ' if field == 'mass' else ''}number")
+            raise EnvError(f"{part!r}: {value:g} is no possible {field}: give a finite{' positive' * (field == 'mass')} number")
         changes.append(Change(name.strip(), field, op, value))
     return changes
 
@@ -165,10 +166,10 @@ def perturb(model, changes):
             # acceleration is positive downwards here, so that "=9.81" is the Earth's
             model.opt.gravity[2] = -change.of(-model.opt.gravity[2])
         elif change.field == "gain":
-            actuators = [i for i in range(model.nu) if change.name in (model.actuator(i).name, model.joint(model.actuator_trnid[i, 0]).name)]
+            joints = [model.joint(j).name for j in model.actuator_trnid[:, 0]]
+            actuators = [i for i in range(model.nu) if change.name in (model.actuator(i).name, joints[i])]
             if not actuators:
-                joints = ", ".join(model.joint(j).name for j in model.actuator_trnid[:, 0])
-                raise EnvError(f"no actuator {change.name!r} for its gain: name its joint, one of {joints}")
+                raise EnvError(f"no actuator {change.name!r} for its gain: name its joint, one of {', '.join(joints)}")
             for i in actuators:
                 model.actuator_gainprm[i, 0] = change.of(model.actuator_gainprm[i, 0])
         else:
@@ -206,7 +207,8 @@ class BatchEnv(VectorEnv):
         nominal = mujoco.MjModel.from_xml_path(str(model_path(env_id)))
         self.model = nominal if model is None else model
         if self.model.nq != nominal.nq or self.model.nu < nominal.nu:
-            raise EnvError(f"the given model has {self.model.nq} coordinates and {self.model.nu} actuators, {env_id} has {nominal.nq} and {nominal.nu}")
+            sizes = f"{self.model.nq} coordinates and {self.model.nu} actuators, {env_id} has {nominal.nq} and {nominal.nu}"
+            raise EnvError(f"the given model has {sizes}: give one with the same joints")
         if perturbation:
             perturb(self.model, perturbation)
         self.dt = self.model.opt.timestep * self.task.frame_skip

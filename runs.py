@@ -51,7 +51,7 @@ def save_whole(path, tensors):
 
 def versions():
     """What the numbers of a run depend on besides its settings."""
-    packages = {"mujoco": mujoco.__version__, "gymnasium": gymnasium.__version__, "torch": torch.__version__, "numpy": np.__version__}
+    packages = {package.__name__: package.__version__ for package in (mujoco, gymnasium, torch, np)}
     return {"python": platform.python_version(), **packages, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
 
 
@@ -167,9 +167,12 @@ class Run:
         se = np.array([float(r["real_return_deterministic_se"]) for r in self.progress])
         if steps:
             left.errorbar(steps, mean, se, color="#1f5fa8", marker="o", capsize=3, label="on real, deterministic")
-            left.plot(steps, [float(r["real_return_stochastic"]) for r in self.progress], color="#1f5fa8", ls=":", label="on real, stochastic")
-        for (name, value), color in zip(self.lines.items(), ("#c0392b", "#2e8b57")):
-            left.axhline(value, color=color, lw=1.2, label=name)
+            stochastic = [float(r["real_return_stochastic"]) for r in self.progress]
+            left.plot(steps, stochastic, color="#1f5fa8", ls=":", label="on real, stochastic")
+        for name, value in self.lines.items():
+            left.axhline(value, color="#2e8b57", lw=1.2, label=name)
+        if steps:
+            left.axhline(mean[0], color="#c0392b", lw=1.2, label="before grounding")
         left.set(xlabel="grounding step", ylabel="return on real")
         left.xaxis.get_major_locator().set_params(integer=True)
         if left.get_legend_handles_labels()[0]:

@@ -43,13 +43,19 @@ class Settings:
     """Everything that decides a run's numbers, but for --out."""
 
     env: str = option("Hopper-v4", "task: InvertedPendulum, Hopper or HalfCheetah, -v4 or -v5")
-    algo: str = option("rgat", "how to ground: rgat, gat, ane, oracle, physics (diagnose.py); sim and real train in that world alone", choices=[*METHODS, "physics"])
+    algo: str = option(
+        "rgat",
+        "how to ground: rgat, gat, ane, oracle, physics (diagnose.py); sim and real train in that world alone",
+        choices=[*METHODS, "physics"],
+    )
     seed: int = option(0, "seed of everything random")
-    real: str = option(None, "what makes the real world differ, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)")
+    real: str = option(None, "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)")
     policy: str = option("deep", "hidden layers of the target policy: deep 2x64, shallow 1x4", choices=["deep", "shallow"])
     pretrain_steps: int = option(None, "steps in the raw sim before the first grounding step (default: by task)")
     grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
-    real_trajectories: int = option(None, "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)")
+    real_trajectories: int = option(
+        None, "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)"
+    )
     at_steps: int = option(None, "sim steps per grounding step for the action transformer (default: by task)")
     policy_steps: int = option(None, "grounded-sim steps per grounding step for the policy (default: by task)")
     eval_episodes: int = option(20, "real episodes per evaluation, deterministic and again stochastic")
@@ -58,15 +64,22 @@ class Settings:
     at_gamma: float = option(AT_CONFIG.gamma, "rgat: discount of the action transformer")
     at_entropy: float = option(AT_CONFIG.entropy, "rgat: entropy coefficient of the action transformer")
     at_std: float = option(None, "rgat: its initial standard deviation, as a part of the action range (default: by task)")
-    forward_model: str = option("residual", "rgat, gat: f_psi corrects the sim's own prediction, or is the paper's network of (s, a) alone", choices=["residual", "plain"])
+    forward_model: str = option(
+        "residual",
+        "rgat, gat: f_psi corrects the sim's own prediction, or (plain) is the paper's network of (s, a) alone",
+        choices=["residual", "plain"],
+    )
     threads: int = option(0, "cores that this run may take (default: all); seeds side by side do best with 1 each")
     pretrained: str = option("", "folder that keeps policies trained from scratch, for other runs to share")
-    ane_width: float = option(GroundingSettings.ane_width, "ane: standard deviation of the action noise, as a part of half the action range")
+    ane_width: float = option(
+        GroundingSettings.ane_width, "ane: standard deviation of the action noise, as a part of half the action range"
+    )
 
     def completed(self):
         """These settings with the task's defaults filled in. Raises EnvError or RunError for impossible ones."""
         task = task_of(self.env)
-        defaults = {**DEFAULTS[self.env.split("-")[0]], "real": task.real, "real_trajectories": 1 if self.algo == "physics" else 50}
+        trajectories = 1 if self.algo == "physics" else 50
+        defaults = {**DEFAULTS[self.env.split("-")[0]], "real": task.real, "real_trajectories": trajectories}
         done = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
         for name, least in COUNTS.items():
             if getattr(done, name) < least:
@@ -83,7 +96,8 @@ class Settings:
 
 
 COUNTS = {
-    "seed": 0, "pretrain_steps": 0, "grounding_steps": 0, "real_trajectories": 1, "at_steps": 1, "policy_steps": 0, "eval_episodes": 1, "num_envs": 1, "threads": 0
+    "seed": 0, "pretrain_steps": 0, "grounding_steps": 0, "real_trajectories": 1, "at_steps": 1, "policy_steps": 0,
+    "eval_episodes": 1, "num_envs": 1, "threads": 0,
 }  # fmt: skip
 
 
@@ -129,15 +143,16 @@ def collect(s, grounding, policy, real, seed):
 
 def nothing(env):
     """Transitions of length 0."""
-    obs, act = np.empty((0, env.single_observation_space.shape[0]), np.float32), np.empty((0, env.single_action_space.shape[0]), np.float32)
-    return Transitions(obs, act, obs)
+    s, a = (np.empty((0, space.shape[0]), np.float32) for space in (env.single_observation_space, env.single_action_space))
+    return Transitions(s, a, s)
 
 
 def errors(s, sim, grounding, real, policy, seed):
     """One-step errors with the transformer and without, on real transitions that nothing was fitted on."""
     held_out = rollouts(policy, real, s.eval_episodes, seed)[1]
     error, change = one_step_error(grounding.sim, grounding.transformer, held_out)
-    return {"at_one_step_error": error, "identity_one_step_error": one_step_error(sim, identity, held_out)[0], "delta_action_rms": change}
+    untouched = one_step_error(sim, identity, held_out)[0]
+    return {"at_one_step_error": error, "identity_one_step_error": untouched, "delta_action_rms": change}
 
 
 def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
@@ -159,7 +174,8 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
         "seconds": round(float(before["seconds"]) + seconds, 1),
     }
     acting = {"sizes": list(learner.policy.sizes), "state": learner.policy.state_dict()}
-    run.record(row, {"learner": learner.state(), "grounding": grounding.state(), "acting": acting}, tau_new)
+    transformer = grounding.state() if step else {}
+    run.record(row, {"learner": learner.state(), "grounding": transformer, "acting": acting}, tau_new)
     bar.say(f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real")
 
 
@@ -174,9 +190,8 @@ def start(s, run, sim, real, bar):
     """The learner, the grounding and tau_real that the next grounding step goes on from; step 0 if there is none yet."""
     world = real if s.algo == "real" else sim
     method = Physics if s.algo == "physics" else METHODS[s.algo]
-    settings = GroundingSettings(
-        at=dataclasses.replace(AT_CONFIG, max_kl=s.at_max_kl, gamma=s.at_gamma, entropy=s.at_entropy), at_std=s.at_std, residual=s.forward_model == "residual", ane_width=s.ane_width
-    )
+    at = dataclasses.replace(AT_CONFIG, max_kl=s.at_max_kl, gamma=s.at_gamma, entropy=s.at_entropy)
+    settings = GroundingSettings(at, s.at_std, s.forward_model == "residual", ane_width=s.ane_width)
     grounding = method(world, settings, real.model) if s.algo == "oracle" else method(world, settings)
     learner = new_learner(s)
     tau_real = nothing(real)
@@ -191,21 +206,22 @@ def start(s, run, sim, real, bar):
             raise RunError(f"{run.folder}/step_{done:02d}.pt does not belong to this run: start a new one") from None
         for step in range(1, done + 1):
             tau_real += Transitions(*run.real(step))
-        bar.skip(sum(int(run.progress[-1][k]) for k in ("sim_steps", "real_transitions") if k == "sim_steps" or s.algo == "real"))
+        bar.skip(int(run.progress[-1]["real_transitions" if s.algo == "real" else "sim_steps"]))
         bar.lap()
         return learner, grounding, tau_real
 
     learner.load(pretrained(s, "real" if s.algo == "real" else "sim", world, bar))
+    reference(s, run, real, bar)
     record(s, run, 0, learner, grounding, real, tau_real, {}, bar)
-    own = run.progress[0]["real_return_deterministic"]
-    if s.algo == "real":
-        run.set_lines(**{"trained on real": own})
-    else:
-        reference = new_learner(s)
-        reference.load(pretrained(s, "real", real, bar))
-        returns = rollouts(reference.policy, real, s.eval_episodes, seed_for(s.seed, 0, "evaluate"), deterministic=True)[0]
-        run.set_lines(**{"trained in sim": own, "trained on real": float(returns.mean())})
     return learner, grounding, tau_real
+
+
+def reference(s, run, real, bar):
+    """The green line: what a policy trained on real from scratch, with the sim policy's budget, returns there."""
+    learner = new_learner(s)
+    learner.load(pretrained(s, "real", real, bar))
+    seed = seed_for(s.seed, 0, "evaluate")
+    run.set_lines(**{"trained on real": float(rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)[0].mean())})
 
 
 def new_learner(s):
@@ -218,20 +234,26 @@ def new_learner(s):
 
 
 def pretrained(s, world, env, bar):
-    """TRPO from scratch in a world ("sim" or "real"): the learner's state, shared by all runs that name one --pretrained folder."""
-    decides = [s.env, s.real if world == "real" else "", s.policy, s.seed, s.pretrain_steps, s.num_envs, PRESETS[s.env.split("-")[0]], versions()]
+    """TRPO from scratch in a world, "sim" or "real": the learner's state. Runs that name one --pretrained folder share it."""
+    preset = PRESETS[s.env.split("-")[0]]
+    decides = [s.env, s.real if world == "real" else "", s.policy, s.seed, s.pretrain_steps, s.num_envs, preset, versions()]
     key = hashlib.sha256(repr(decides).encode()).hexdigest()[:16]
-    path = Path(s.pretrained) / f"{s.env}-{world}-{key}.pt" if s.pretrained else None
-    if path and path.exists():
-        bar.skip(s.pretrain_steps)
-        return load_checkpoint(path)
+    folder = Path(s.pretrained) if s.pretrained else bar.run.folder
+    path = folder / f"{s.env}-{world}-{key}.pt"
+    if path.exists():
+        bar.skip(s.pretrain_steps, counts=world == bar.world)
+        try:
+            return load_checkpoint(path)
+        except ValueError as error:
+            raise RunError(f"{error}; delete it") from None
     learner = new_learner(s)
-    learner.learn(
-        env, s.pretrain_steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=bar.phase(0, "pretrain" if world == s.algo or world == "sim" else "reference")
-    )
-    if path:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_whole(path, learner.state())
+    log = bar.phase(0, "pretrain" if world == bar.world else "reference")
+    learner.learn(env, s.pretrain_steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=log)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"cannot make the folder {folder}: {error.strerror}; choose another --pretrained") from None
+    save_whole(path, learner.state())
     return learner.state()
 
 
@@ -243,6 +265,7 @@ class Bar:
 
     def __init__(self, s, run):
         self.run, self.seen, self.drawn, self.clock = run, 0, time.monotonic(), time.monotonic()
+        self.world = "real" if s.algo == "real" else "sim"
         at_steps = s.at_steps * (s.algo == "rgat")
         total = s.pretrain_steps * (1 if s.algo == "real" else 2) + s.grounding_steps * (s.policy_steps + at_steps)
         self.tqdm = tqdm(total=total, unit="step", unit_scale=True, disable=None, dynamic_ncols=True, smoothing=0.05)
@@ -264,9 +287,9 @@ class Bar:
 
         return on_update
 
-    def skip(self, steps):
-        """Steps that an earlier run has done."""
-        self.seen += steps
+    def skip(self, steps, counts=True):
+        """Steps that an earlier run has done; counts: they are this run's own, not a reference line's."""
+        self.seen += steps * counts
         self.tqdm.update(steps)
 
     def lap(self):
@@ -287,8 +310,9 @@ def verdict(s, run):
     returns = rollouts(policy, real, 2 * s.eval_episodes, seed_for(s.seed, step, "best"), deterministic=True)[0]
     best = {"grounding_step": step, "episodes": len(returns), "real_return_deterministic": float(returns.mean()), "se": standard_error(returns)}
     write_whole(run.folder / "best.json", json.dumps(best, indent=1))
-    lines = ", ".join(f"{name} {value:.0f}" for name, value in run.lines.items())
-    return f"{run.folder}: best on real after grounding step {step}: {best['real_return_deterministic']:.0f} ± {best['se']:.0f} on {len(returns)} fresh episodes ({lines})"
+    shown = f"{best['real_return_deterministic']:.0f} ± {best['se']:.0f} on {len(returns)} fresh episodes"
+    untouched, line = float(run.progress[0]["real_return_deterministic"]), run.lines["trained on real"]
+    return f"{run.folder}: best on real after grounding step {step}: {shown} (before grounding {untouched:.0f}, trained on real {line:.0f})"
 
 
 def replay(folder):

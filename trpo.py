@@ -308,11 +308,12 @@ def rollouts(policy, env, episodes, seed, deterministic=False):
             total, alive = np.zeros(env.num_envs), wanted.copy()
             while alive.any():
                 obs = np.asarray(obs, np.float32)
-                action = policy.mean(torch.from_numpy(obs)) if deterministic else policy.act(torch.from_numpy(obs), generator)
-                action = np.clip(action.numpy(), low, high)
-                before = obs
+                before = torch.from_numpy(obs)
+                action = policy.mean(before) if deterministic else policy.act(before, generator)
+                action, before = np.clip(action.numpy(), low, high), obs
                 obs, reward, terminated, truncated, info = env.step(action)
-                rows.append((before[alive], action[alive], info["next_obs"][alive].astype(np.float32), np.flatnonzero(alive) + len(returns)))
+                after = info["next_obs"][alive].astype(np.float32)
+                rows.append((before[alive], action[alive], after, np.flatnonzero(alive) + len(returns)))
                 total += reward * alive
                 alive &= ~(terminated | truncated)
             returns += list(total[wanted])

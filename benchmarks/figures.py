@@ -42,7 +42,7 @@ def draw_grounding(rows, best):
             axes.plot(mean, color=color, lw=2, marker="o", ms=4, label=f"{algo}, {len(values)} seed{'s' * (len(values) > 1)}")
             axes.fill_between(range(length), mean - se, mean + se, color=color, alpha=0.2, lw=0)
         lines = [row for row in best if row["env"] == env and row["policy"] == policy and row["tag"] == "default"]
-        for column, color in (("trained_on_real", COLORS["real"]), ("trained_in_sim", COLORS["sim"])):
+        for column, color in (("trained_on_real", COLORS["real"]), ("before_grounding", COLORS["sim"])):
             values = [float(v) for v in {row["seed"]: row[column] for row in lines if row[column]}.values()]
             if values:
                 axes.axhline(np.mean(values), color=color, lw=1.2, ls="--", label=f"{column.replace('_', ' ')}, mean of {len(values)}")

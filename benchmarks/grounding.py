@@ -56,9 +56,11 @@ def main():
             if train.main(options):
                 sys.exit(f"{folder}: stopped; call again to go on")
             append(args.results / "grounding.csv", [{**key, **row} for row in csv.DictReader((folder / "progress.csv").open(newline=""))])
-            lines = json.loads((folder / "lines.json").read_text())
-            best = json.loads((folder / "best.json").read_text())
-            append(args.results / "best.csv", [{**key, **best, "trained_in_sim": lines.get("trained in sim", ""), "trained_on_real": lines["trained on real"]}])
+            with (folder / "progress.csv").open(newline="") as file:
+                before = next(csv.DictReader(file))["real_return_deterministic"]
+            best, lines = (json.loads((folder / name).read_text()) for name in ("best.json", "lines.json"))
+            row = {**key, **best, "before_grounding": before, "trained_on_real": lines["trained on real"]}
+            append(args.results / "best.csv", [row])
 
 
 if __name__ == "__main__":

@@ -92,10 +92,12 @@ def ground(s, v, sim, real, policy, tau_real, seed):
 class Quiet:
     """The part of train.Bar that train.pretrained needs, silent."""
 
+    world = "sim"
+
     def phase(self, step, name):
         return None
 
-    def skip(self, steps):
+    def skip(self, steps, counts=True):
         pass
 
 
