@@ -154,12 +154,14 @@ def _detection_figure(rows):
             if chosen:
                 a, b = wilson(sum(chosen), len(chosen))
                 axis.plot([k + shift] * 2, [a, b], color="C0" if shift < 0 else "C1")
-                axis.plot(k + shift, np.mean(chosen), "o", color="C0" if shift < 0 else "C1", label=label if k == 1 else None)
+                axis.plot(k + shift, np.mean(chosen), "o", color="C0" if shift < 0 else "C1", label=label)
                 if shift < 0:
                     axis.text(k, 1.04, f"n={len(chosen)}", ha="center", fontsize=8)
     axis.set_xticks(range(len(EDGES) - 1), [f"{a:g}–{b:g}" for a, b in zip(EDGES, EDGES[1:])])
     axis.set(xlabel="how far the effect moves the held-out prediction, over the noise", ylabel="rate", ylim=(-0.02, 1.12))
-    axis.legend(loc="lower right")
+    handles = dict(zip(*axis.get_legend_handles_labels()[::-1]))              # one of each
+    if handles:
+        axis.legend(handles.values(), handles.keys(), loc="lower right")
     return _picture(figure)
 
 
