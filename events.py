@@ -16,6 +16,7 @@ import shooting
 
 LEVEL = 1e-3  # false-alarm rate, shared between all intervals and effects
 CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the interval must explain
+QUIET = 3.0  # squared residual over the noise's, of the windows without an event, above which something else is wrong
 LONGEST = 0.7  # of a recording: what lasts longer is no event
 
 
@@ -54,6 +55,9 @@ def find(world, problem, fit):
         settings += [{**fit.hypothesis.settings, steady: m[steady]} for m in moved]
         moves.append(step)
     scan = shooting.project(problem, fit, shooting.columns(problem, [fit], [settings])[0])
+    rows = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
+    if np.quantile(scan.chi2 / rows, 0.3) > QUIET:
+        return None
     excess = (scan.chi2 - np.quantile(scan.chi2, 0.3)).clip(0).sum()
     best, everything = None, []
     recordings = list({id(w.recording): w.recording for w in problem.windows}.values())

@@ -28,7 +28,7 @@ from recordings import RecordingError
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
 FINAL_STEPS = 30000
 LEAST_ROWS, LEAST_WINDOWS, FEW_ROWS = 8, 20, 100
-LEFTOVER_SPANS, LEFTOVER_WORTH = (0.2, 0.1), 0.02  # s; share of the nominal's squared residual that a leftover must explain
+LEFTOVER_SPANS, LEFTOVER_WORTH = (0.2, 0.1), 0.05  # s; share of the nominal's squared residual that a leftover must explain
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
@@ -78,13 +78,17 @@ def identify(world, train, held_out, progress=None):
     say(0.75, "testing for anything left")
     hypothesis, left = anything_left(data, search, hypothesis)
     say(0.8, "intervals")
-    final = problem_of(*data, span, FINAL_STEPS)
-    fit = shooting.fit_starts(final, hypothesis)
+    final = selection.Search(world, problem_of(*data, span, FINAL_STEPS), train)
+    fit = shooting.fit_starts(final.problem, hypothesis)
     if hypothesis.effects:
-        [fit] = shooting.solve(final, [hypothesis], fit)
+        [fit] = shooting.solve(final.problem, [hypothesis], fit)
+        fit = final.drop(fit, ())
+        hypothesis = fit.hypothesis
+    if left and left.simulable and not any(c.effect.name == "unknown" for c in hypothesis.candidates):
+        left = None
     say(0.9, "held-out error")
     position_noise, velocity_noise = lowered_noise(world, train, position_noise, velocity_noise, hypothesis)
-    return assemble(world, train, held_out, fit, selection.Search(world, final, train), possible, left, event, ranking,
+    return assemble(world, train, held_out, fit, final, possible, left, event, ranking,
                     position_noise, velocity_noise)
 
 
@@ -187,7 +191,8 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
     shortest = max(LEAST_ROWS * sample, at_least)
     if sum(len(r.time) for r in train) < FEW_ROWS:  # too little to be cut
         return float(duration)
-    longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration))
+    enough = sum(np.ptp(r.time) for r in train) / 12  # clusters need windows
+    longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration, enough))
 
     def followed(span):
         problem = problem_of(world, train, position_noise, velocity_noise, event, span, SEARCH_STEPS / 4)

@@ -8,7 +8,7 @@ An effect is added when its gain is significant after correction for the number 
 scores.wald), when clusters that its value was not fitted to gain too, and when the residual falls noticeably.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -60,6 +60,8 @@ def options_of(world, recordings):
     for candidate in world.candidates:
         if candidate.effect.timed:
             continue
+        if candidate.effect.name == "cogging":
+            candidate = rippling(world, candidate, recordings)
         if candidate.effect.overrides("probes"):
             out += [Option(candidate, (tuple(float(v) for v in row),), False) for row in world.probes(candidate, recordings)]
         else:
@@ -68,6 +70,14 @@ def options_of(world, recordings):
             if candidate.effect.name == "mass":  # far from its nominal a mass does not act in proportion
                 out += [Option(candidate, ((factor * candidate.nominal[0],),), False) for factor in (4.0, 20.0)]
     return out
+
+
+def rippling(world, candidate, recordings):
+    """Cogging with at least one whole wave within the recorded travel: less is only a bent spring."""
+    address = world.model.joint(candidate.place.name).qposadr[0]
+    travel = max(np.nanmax(r.qpos[:, address]) - np.nanmin(r.qpos[:, address]) for r in recordings)
+    least = 2 * np.pi / max(travel, 1e-9)
+    return replace(candidate, parameters=tuple(replace(p, low=max(p.low, least)) if p.name == "poles" else p for p in candidate.parameters))
 
 
 class Search:
@@ -126,9 +136,13 @@ class Search:
                     + share.T @ gram[:, :k, :k] @ share)
         return gram, score
 
-    def trials(self, fit):
-        """All options not yet in the hypothesis, best gain first; the cluster sums of their columns; chi2 before."""
-        options = [o for o in self.options if o.candidate not in fit.hypothesis.candidates]
+    def trials(self, fit, late=True):
+        """All options not yet in the hypothesis, best gain first; the cluster sums of their columns; chi2 before.
+
+        Flexible effects that can look like several simple ones (ripples, bends, gaps) come late, when those are exhausted.
+        """
+        options = [o for o in self.options if o.candidate not in fit.hypothesis.candidates
+                   and (late or o.linear or o.candidate.effect.simplicity < 2)]
         plain = [o for o in options if o.linear]
         return self.scan(fit, plain + self.screened(fit, [o for o in options if not o.linear]), self.problem)
 
@@ -213,9 +227,9 @@ class Search:
 
     def run(self, fit, most=6, singles=5, doubles=2):
         """Additions, drops and swaps from the nominal fit: (Fit, [Step])."""
-        steps = []
+        steps, late = [], False
         for _ in range(most):
-            trials, gram, score, chi2 = self.trials(fit)
+            trials, gram, score, chi2 = self.trials(fit, late)
             if not self.ranking:
                 self.ranking = trials
             level, worth = ALPHA / self.places, self.worth(fit)
@@ -224,8 +238,11 @@ class Search:
             best = max((t.gain for t in trials if t.start), default=0.0)
             proposals += [list(pair) for gain, *pair in self.pairs(trials, gram, score, doubles)
                           if gain > best + max(2 * worth * chi2, 0.1 * best)]
-            if not proposals:
+            if not proposals and late:
                 break
+            if not proposals:
+                late = True
+                continue
             hypotheses = [fit.hypothesis for _ in proposals]
             for i, proposal in enumerate(proposals):
                 for candidate, start in proposal:
@@ -233,8 +250,11 @@ class Search:
             self.progress(f"refitting {len(hypotheses)} hypotheses")
             fits = shooting.solve(self.small, hypotheses, fit.subset(self.few), iterations=4)
             chosen = self.choose(fit, fits, proposals)
-            if chosen is None:
+            if chosen is None and late:
                 break
+            if chosen is None:
+                late = True
+                continue
             new, added, p = chosen
             steps.append(Step(added, p, float(new.chi2.sum()), trials))
             fit = self.drop(new, added)
@@ -293,10 +313,11 @@ class Search:
         """The hypothesis that wins, refitted to all windows, as (Fit, added candidates, p-value); None when none earns its keep."""
         level, before, worth = ALPHA / self.places, fit.chi2[self.few].sum(), self.worth(fit)
         order = sorted(range(len(fits)), key=lambda i: fits[i].chi2.sum())
-        # a pair wins only over what the best single leaves for a second step
+        # a pair wins only over what the best single leaves for a second step, unless that has as many parameters
         single = next((i for i in order if len(proposals[i]) == 1), None)
         if single is not None and len(proposals[order[0]]) == 2:
-            if fits[order[0]].chi2.sum() > 0.7 * fits[single].chi2.sum():
+            size = [sum(len(c.parameters) for c, _ in proposals[i]) for i in (single, order[0])]
+            if size[0] < size[1] and fits[order[0]].chi2.sum() > 0.7 * fits[single].chi2.sum():
                 order.remove(single)
                 order.insert(0, single)
         for i in order[:3]:
@@ -304,7 +325,8 @@ class Search:
             if 1 - fits[i].chi2.sum() / before < 0.5 * worth * len(added):
                 continue
             [new] = shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4)
-            if 1 - new.chi2.sum() / fit.chi2.sum() < worth * len(added) or not self.shared(fit, new, worth):
+            needed = worth * sum(len(c.parameters) if c.effect.simplicity > 2 else 1 for c in added)
+            if 1 - new.chi2.sum() / fit.chi2.sum() < needed or not self.shared(fit, new, worth):
                 continue
             p = max(self.significance(new, c)[0] for c in added)
             if p < level:
@@ -391,7 +413,13 @@ class Search:
         own = [{**s, candidate: values} for s in shooting.perturbed(without)[0]]
         options = [o for o in self.options if o.candidate not in small.hypothesis.candidates and (o.linear or o in self.kept)]
         tried = [small.hypothesis.plus(o.candidate, d).settings for o in options for d in o.directions]
-        slope = shooting.columns(self.small, [small], [own + [without.settings] + tried])[0]
+        # absence is extrapolated from a tenth less, unless the effect is a limit: unstable motion is soon not linear
+        nominal, less = np.array(candidate.nominal), without.settings
+        tenth = np.isfinite(nominal).all()
+        if tenth:
+            less = without.plus(candidate, nominal + 0.9 * (np.array(values) - nominal)).settings
+        slope = shooting.columns(self.small, [small], [own + [less] + tried])[0]
+        slope[..., len(own)] *= 10.0 if tenth else 1.0
         scan = shooting.project(self.small, small, slope)
         gram, k = scan.gram.sum(0), len(own)
         score = scan.score.sum(0) - gram[:, k]  # of the residual without the effect
@@ -414,13 +442,16 @@ class Search:
                 singles.append((chi2, option, columns, start))
         singles.sort(key=lambda s: s[0])
         now = scan.chi2.sum()
-        close, seen = [], set()
+        hypotheses, seen = [], set()
         for chi2, option, _, start in singles:
-            if option.candidate not in seen and (chi2 < 1.5 * now or alone - chi2 > 0.9 * (alone - now)):
-                close.append((option, start))
+            if option.candidate not in seen and len(seen) < 2 * most and alone - chi2 > 0.5 * (alone - now):
+                hypotheses.append(without.plus(option.candidate, start))
                 seen.add(option.candidate)
-        close = close[:most]
-        hypotheses = [without.plus(option.candidate, start) for option, start in close]
+        # a first look at full size, where what is alike in a small step may differ, and the other way round
+        looks = [shooting.project(self.small, f, np.zeros(f.residual.shape + (0,))).chi2.sum()
+                 for f in shooting.evaluate(self.small, hypotheses, small)]
+        order = sorted(range(len(looks)), key=looks.__getitem__)[:most]
+        hypotheses = [hypotheses[i] for i in order if looks[i] < now + 0.5 * (alone - now)]
         pair = None
         pairs = [(left(a[2] + b[2])[0], a, b) for i, a in enumerate(singles[:8]) for b in singles[i + 1:8] if a[1].candidate != b[1].candidate]
         if pairs:
@@ -434,7 +465,7 @@ class Search:
         if pair:
             last = fits.pop()
             pair = last.hypothesis if last.chi2.sum() < (1 - 2 * WORTH) * small.chi2.sum() else None
-        return [(f, option.candidate) for f, (option, _) in zip(fits, close)], pair
+        return [(f, f.hypothesis.candidates[-1]) for f in fits], pair
 
 
 def simplicity(candidate):

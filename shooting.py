@@ -231,7 +231,7 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
     warm = warm if isinstance(warm, list) else [warm] * len(hypotheses)
     every = np.arange(len(problem.windows))
     number = len(every)
-    current = _evaluate(problem, hypotheses, warm)
+    current = evaluate(problem, hypotheses, warm)
     damping = np.full(len(hypotheses), 1e-3)
     moving = [h for h in range(len(hypotheses))]
     for iteration in range(iterations):
@@ -299,7 +299,11 @@ def _polish(problem, current, which):
                          np.where(better, r, fit.residual), fit.start_jacobian)
 
 
-def _evaluate(problem, hypotheses, warm):
+def evaluate(problem, hypotheses, warm):
+    """Fits at hypotheses as they stand, from the start states of warm (a Fit, or one for each)."""
+    warm = warm if isinstance(warm, list) else [warm] * len(hypotheses)
+    if not hypotheses:
+        return []
     every = np.arange(len(problem.windows))
     residual = problem.residuals([s for h in hypotheses for s in [h.settings] * len(every)],
                                  np.tile(every, len(hypotheses)), np.concatenate([f.qpos for f in warm]),
