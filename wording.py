@@ -124,7 +124,10 @@ def unexplained_words(summary):
         return ""
     at = f" at {place_words(left['place'])}" if left.get("place") else ""
     on = depends_words(left.get("depends_on"))
-    return f"{100 * left['fraction']:.0f} % of the original error stays unexplained{at}{f', depending on {on}' if on else ''}"
+    share, on = f"{100 * left['fraction']:.0f} %", f", depending on {on}" if on else ""
+    if summary["verdict"] == "match":
+        return f"{share} of the squared error is more than noise{at}{on}, and no effect explains it"
+    return f"{share} of the original squared error stays unexplained{at}{on}"
 
 
 def verdict_words(summary):
