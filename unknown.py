@@ -124,13 +124,15 @@ def leftover(search, problem, fit, least):
         tests += len(options)
         for variables, basis, knots, simulable in options:
             k = basis.shape[1]
-            gram = np.zeros((len(basis), own + k, own + k))
-            gram[:, :own, :own] = scan.gram[:, :own, :own]
-            gram[:, :own, own:] = scan.gram[:, :own, column, None] * basis[:, None, :]
-            gram[:, own:, :own] = np.swapaxes(gram[:, :own, own:], 1, 2)
-            gram[:, own:, own:] = scan.gram[:, column, column, None, None] * basis[:, :, None] * basis[:, None, :]
-            score = np.concatenate([scan.score[:, :own], scan.score[:, column, None] * basis], 1)
-            gram, score = search.freed(scores.summed(labels, gram), scores.summed(labels, score), own)
+            pick = [*range(own), column]  # a constant force is no dependence: it is projected out with the named effects
+            b = len(pick)
+            gram = np.zeros((len(basis), b + k, b + k))
+            gram[:, :b, :b] = scan.gram[:, pick][:, :, pick]
+            gram[:, :b, b:] = scan.gram[:, pick, column][:, :, None] * basis[:, None, :]
+            gram[:, b:, :b] = np.swapaxes(gram[:, :b, b:], 1, 2)
+            gram[:, b:, b:] = scan.gram[:, column, column, None, None] * basis[:, :, None] * basis[:, None, :]
+            score = np.concatenate([scan.score[:, pick], scan.score[:, column, None] * basis], 1)
+            gram, score = search.freed(scores.summed(labels, gram), scores.summed(labels, score), b)
             seen = np.einsum("ckk->k", gram) > shooting.UNSEEN
             if not seen.any():
                 continue
