@@ -5,6 +5,7 @@ import io
 import json
 import os
 import platform
+import zipfile
 from pathlib import Path
 
 import gymnasium
@@ -14,7 +15,7 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
-from models import load_checkpoint
+from models import GaussianPolicy, load_checkpoint
 
 PROGRESS = (
     "grounding_step real_transitions sim_steps real_return_deterministic real_return_deterministic_se "
@@ -90,7 +91,7 @@ class Run:
             settings = config["settings"]
             run.progress = run._read("progress.csv")
             done = len(run.progress)
-            run.train = [row for row in run._read("train.csv") if int(row["grounding_step"]) < done]
+            run.train = [row for row in run._read("train.csv") if int(row["grounding_step"]) < max(done, 1)]
             if (run.folder / "lines.json").exists():
                 run.lines = json.loads((run.folder / "lines.json").read_text())
         except FileNotFoundError:
@@ -142,16 +143,21 @@ class Run:
         except ValueError as error:
             raise RunError(f"{error}; start a new run") from None
 
+    def policy(self):
+        """The best policy so far. Raises RunError if its file is missing or damaged."""
+        try:
+            return GaussianPolicy.load(self.folder / "policy.pt")
+        except ValueError as error:
+            raise RunError(f"{self.folder}: {error}; start a new run") from None
+
     def real(self, step):
-        """The arrays s, a, s_next collected before a step, or None."""
+        """The arrays s, a, s_next collected before a step. Raises RunError if they are missing or damaged."""
         path = self.folder / f"real_{step:02d}.npz"
-        if not path.exists():
-            return None
         try:
             with np.load(path, allow_pickle=False) as data:
                 return data["s"], data["a"], data["s_next"]
-        except (ValueError, KeyError, OSError) as error:
-            raise RunError(f"{path} is damaged ({type(error).__name__}): start a new run") from None
+        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+            raise RunError(f"{path} is missing or damaged ({type(error).__name__}): start a new run") from None
 
     def set_lines(self, **lines):
         """Remember the reference returns drawn as horizontal lines."""

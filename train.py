@@ -25,6 +25,7 @@ from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, identity, o
 from remodel import Physics
 from runs import Run, RunError, animate, save_whole, versions, write_whole
 from trpo import PRESETS, TRPO, Transitions, rollouts
+from world import quiet
 
 # settings that suit each task, where the command line does not say
 DEFAULTS = {
@@ -192,8 +193,8 @@ def start(s, run, sim, real, bar):
     method = Physics if s.algo == "physics" else METHODS[s.algo]
     at = dataclasses.replace(AT_CONFIG, max_kl=s.at_max_kl, gamma=s.at_gamma, entropy=s.at_entropy)
     settings = GroundingSettings(at, s.at_std, s.forward_model == "residual", ane_width=s.ane_width)
+    learner = new_learner(s)  # seeds torch for the grounding's networks too
     grounding = method(world, settings, real.model) if s.algo == "oracle" else method(world, settings)
-    learner = new_learner(s)
     tau_real = nothing(real)
     done = len(run.progress) - 1
     if done >= 0:
@@ -211,15 +212,16 @@ def start(s, run, sim, real, bar):
         return learner, grounding, tau_real
 
     learner.load(pretrained(s, "real" if s.algo == "real" else "sim", world, bar))
-    reference(s, run, real, bar)
+    reference(s, run, learner, real, bar)
     record(s, run, 0, learner, grounding, real, tau_real, {}, bar)
     return learner, grounding, tau_real
 
 
-def reference(s, run, real, bar):
+def reference(s, run, learner, real, bar):
     """The green line: what a policy trained on real from scratch, with the sim policy's budget, returns there."""
-    learner = new_learner(s)
-    learner.load(pretrained(s, "real", real, bar))
+    if s.algo != "real":
+        learner = new_learner(s)
+        learner.load(pretrained(s, "real", real, bar))
     seed = seed_for(s.seed, 0, "evaluate")
     run.set_lines(**{"trained on real": float(rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)[0].mean())})
 
@@ -240,19 +242,23 @@ def pretrained(s, world, env, bar):
     key = hashlib.sha256(repr(decides).encode()).hexdigest()[:16]
     folder = Path(s.pretrained) if s.pretrained else bar.run.folder
     path = folder / f"{s.env}-{world}-{key}.pt"
+    learner = new_learner(s)
     if path.exists():
         bar.skip(s.pretrain_steps, counts=world == bar.world)
         try:
-            return load_checkpoint(path)
-        except ValueError as error:
-            raise RunError(f"{error}; delete it") from None
-    learner = new_learner(s)
-    log = bar.phase(0, "pretrain" if world == bar.world else "reference")
+            learner.load(load_checkpoint(path))
+        except (ValueError, KeyError, TypeError, RuntimeError):
+            raise RunError(f"{path} holds no trained policy of this program: delete it") from None
+        return learner.state()
+    name = "pretrain" if world == bar.world else "reference"
+    bar.run.train = [row for row in bar.run.train if row["phase"] != name]  # what a cut-off attempt left
+    log = bar.phase(0, name)
     learner.learn(env, s.pretrain_steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=log)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"cannot make the folder {folder}: {error.strerror}; choose another --pretrained") from None
+    bar.run.flush()
     save_whole(path, learner.state())
     return learner.state()
 
@@ -305,7 +311,7 @@ class Bar:
 def verdict(s, run):
     """The best policy judged once more, on real episodes that did not choose it: best.json, and a line that says so."""
     step = max(range(len(run.progress)), key=lambda k: float(run.progress[k]["real_return_deterministic"]))
-    policy = GaussianPolicy.load(run.folder / "policy.pt")
+    policy = run.policy()
     real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real))
     returns = rollouts(policy, real, 2 * s.eval_episodes, seed_for(s.seed, step, "best"), deterministic=True)[0]
     best = {"grounding_step": step, "episodes": len(returns), "real_return_deterministic": float(returns.mean()), "se": standard_error(returns)}
@@ -318,8 +324,8 @@ def verdict(s, run):
 def replay(folder):
     """Draw a run's best policy acting in sim and on real into the run's replay.gif."""
     run, saved = Run.open(folder)
-    s = Settings(**saved).completed()
-    policy = GaussianPolicy.load(run.folder / "policy.pt")
+    s = settings_of(folder, saved)
+    policy = run.policy()
     worlds = {"sim": BatchEnv(s.env, 1), "real": BatchEnv(s.env, 1, parse_perturbation(s.real))}
     if policy.sizes[0] != worlds["sim"].single_observation_space.shape[0]:
         raise RunError(f"{folder}/policy.pt was trained on another task than {s.env}: start a new run")
@@ -327,9 +333,22 @@ def replay(folder):
     print(f"{run.folder / 'replay.gif'}: " + ", ".join(f"{name} {value:.0f}" for name, value in returns.items()))
 
 
+def settings_of(folder, saved):
+    """The Settings in a run's config.json. Raises RunError where it holds something else."""
+    try:
+        return Settings(**saved).completed()
+    except TypeError:
+        raise RunError(f"{folder}/config.json does not hold this program's settings: start a new run") from None
+
+
+class Parser(argparse.ArgumentParser):
+    def error(self, message):
+        raise RunError(f"{message}; see --help")
+
+
 def parse(argv):
     """The command line as (Settings, its explicit options, arguments of the run itself)."""
-    parser = argparse.ArgumentParser(prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for f in dataclasses.fields(Settings):
         kind = {"int": int, "float": float, "str": str}[getattr(f.type, "__name__", f.type)]
         shown = "" if f.default is None else f" (default: {f.default})"
@@ -343,20 +362,21 @@ def parse(argv):
 
 def main(argv=None):
     """The command; returns its exit status. 0: done; 2: a request that cannot be met, told in one line; 130: Ctrl-C."""
-    args = parse(argv)
     run = None
     try:
+        args = parse(argv)
         if args.replay:
             replay(args.replay)
             return 0
         if args.resume:
             run, saved = Run.open(args.resume)
-            s = Settings(**saved).completed()
+            s = settings_of(args.resume, saved)
         else:
             s = Settings(**{f.name: getattr(args, f.name) for f in dataclasses.fields(Settings)}).completed()
             run = Run.create(args.out or f"runs/{s.env}-{s.algo}-s{s.seed}", dataclasses.asdict(s))
-        algorithm_1(s, run, Bar(s, run))
-        print(verdict(s, run))
+        with quiet():  # MuJoCo's own warnings: an unstable simulation is told below, in one line
+            algorithm_1(s, run, Bar(s, run))
+            print(verdict(s, run))
         return 0
     except (EnvError, RunError) as error:
         print(f"train.py: {error}", file=sys.stderr)
