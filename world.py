@@ -190,7 +190,11 @@ class World:
         spec.meshdir, spec.texturedir = str(folder / self.spec.meshdir), str(folder / self.spec.texturedir)
         spec.compiler.savecompiled = spec.compiler.savecanonical = False
         with quiet():
-            spec.compile()
+            try:
+                spec.compile()
+            except ValueError:  # a fitted inertia that no rigid body has (A + B < C): the nearest that stock MuJoCo takes
+                spec.compiler.balanceinertia = True
+                spec.compile()
             return spec.to_xml(), written
 
 
