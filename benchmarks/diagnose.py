@@ -1,0 +1,117 @@
+"""Time a diagnosis against mujoco.sysid fitting a fixed list of candidates all at once, on 30 s of a two-joint arm.
+
+    python benchmarks/diagnose.py [--seconds 30]        # -> results/diagnose.csv
+
+Hidden: Coulomb friction in the elbow. sysid is told the candidates (mass, armature, damping, frictionloss: eight
+parameters), true start velocities and one-second sequences; the diagnosis is told nothing. mujoco.sysid needs extra
+packages (pip install "mujoco[sysid]"); without them only the diagnosis is timed.
+"""
+
+import argparse
+import csv
+import os
+from pathlib import Path
+import sys
+import time
+
+import mujoco
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from diagnose import diagnose  # noqa: E402
+from recordings import Recording  # noqa: E402
+
+ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><default><geom contype="0" conaffinity="0"/>
+<joint axis="0 1 0" damping="0.05" armature="0.01"/></default><worldbody><body name="upper"><joint name="shoulder"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.35" size=".03" mass="1"/><body name="fore" pos="0 0 -.35"><joint name="elbow"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".025" mass=".6"/></body></body></worldbody>
+<actuator><motor name="a" joint="shoulder"/><motor name="b" joint="elbow"/></actuator>
+<sensor><jointpos name="shoulder_pos" joint="shoulder"/><jointpos name="elbow_pos" joint="elbow"/></sensor></mujoco>"""
+NOISE, FRICTION, INTERVAL = 5e-4, 0.1, 0.01
+
+
+def run(seconds, seed):
+    """(Recording, true qvel) of the arm with Coulomb friction in the elbow, driven by sines."""
+    rng, spec = np.random.default_rng(seed), mujoco.MjSpec.from_string(ARM)
+    elbow = spec.joint("elbow")
+    elbow.frictionloss, elbow.solref_friction[:], elbow.solimp_friction[:3] = FRICTION, [0.004, 1], [0.999, 0.9999, 0.001]
+    model = spec.compile()
+    data, rows = mujoco.MjData(model), round(seconds / INTERVAL)
+    clock = INTERVAL * np.arange(rows)
+    ctrl = (np.array([[1.0, 0.4]]) * np.sin(2 * np.pi * clock[:, None, None] * rng.uniform(0.2, 1.5, (3, 2)) + rng.uniform(0, 6, (3, 2))).sum(1))
+    qpos, qvel = np.empty((rows, 2)), np.empty((rows, 2))
+    for t in range(rows):
+        qpos[t], qvel[t], data.ctrl[:] = data.qpos, data.qvel, ctrl[t]
+        mujoco.mj_step(model, data, round(INTERVAL / model.opt.timestep))
+    return Recording(f"run{seed}.csv", clock, qpos + NOISE * rng.normal(size=qpos.shape), np.full_like(qvel, np.nan), ctrl, {}), qvel
+
+
+def with_sysid(recording, qvel, chunk=100):
+    """{parameter: value} by mujoco.sysid from the same rows, or None where it is not installed."""
+    from mujoco import sysid
+    if not hasattr(sysid, "optimize"):
+        return None
+    spec, parameters = mujoco.MjSpec.from_string(ARM), sysid.ParameterDict()
+    for body, nominal in (("upper", 1.0), ("fore", 0.6)):
+        parameters.add(sysid.Parameter(f"mass {body}", nominal=nominal, min_value=0.1, max_value=5.0,
+                                       modifier=lambda s, p, b=body: setattr(s.body(b).geoms[0], "mass", p.value[0])))
+    for joint in ("shoulder", "elbow"):
+        for field, nominal in (("armature", 0.01), ("damping", 0.05), ("frictionloss", 0.01)):  # at 0 it would not move
+            def modify(s, p, j=joint, f=field):
+                if f == "damping":
+                    s.joint(j).damping[0] = p.value[0]
+                else:
+                    setattr(s.joint(j), f, p.value[0])
+            parameters.add(sysid.Parameter(f"{field} {joint}", nominal=nominal, min_value=0.0, max_value=2.0, modifier=modify))
+    model, names, starts, controls, sensors = spec.compile(), [], [], [], []
+    for first in range(0, len(recording.time) - chunk, chunk):
+        rows = slice(first, first + chunk)
+        clock = recording.time[rows] - recording.time[first]
+        names.append(f"rows{first}")
+        starts.append(sysid.create_initial_state(model, recording.qpos[first], qvel[first]))
+        controls.append(sysid.TimeSeries(clock, recording.ctrl[rows]))
+        sensors.append(sysid.TimeSeries.from_names(clock, recording.qpos[rows], model))
+    sequences = sysid.ModelSequences("arm", spec, names, starts, controls, sensors)
+    found, _ = sysid.optimize(initial_params=parameters, residual_fn=sysid.build_residual_fn(models_sequences=[sequences]),
+                              optimizer="mujoco", verbose=False)
+    return {name: float(found[name].value[0]) for name in found.keys()}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=30.0, help="of recorded motion, in all")
+    parser.add_argument("--out", type=Path, default=ROOT / "results" / "diagnose.csv")
+    options = parser.parse_args()
+    train, qvel = run(0.7 * options.seconds, 0)
+    held, _ = run(0.3 * options.seconds, 1)
+    rows, begun = [], time.monotonic()
+    for finding in diagnose(mujoco.MjSpec.from_string(ARM), [train], [held]).summary["findings"]:
+        for p in finding["parameters"]:
+            rows.append({"method": "diagnose", "parameter": f"{p['name']} {finding['place']['name']}", "value": p["value"], "low": p["low"], "high": p["high"]})
+    seconds = {"diagnose": time.monotonic() - begun}
+    begun = time.monotonic()
+    try:
+        found = with_sysid(train, qvel)
+    except Exception as error:  # an optional package of changing interface: its failure is a result, not ours
+        found = None
+        print(f"mujoco.sysid failed: {type(error).__name__}: {error}", file=sys.stderr)
+    seconds["sysid"] = time.monotonic() - begun
+    rows += [{"method": "sysid", "parameter": name, "value": value} for name, value in (found or {}).items()]
+    temporary = options.out.with_suffix(".tmp")
+    options.out.parent.mkdir(exist_ok=True)
+    with temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ("method", "parameter", "value", "low", "high", "truth", "seconds"))
+        writer.writeheader()
+        for row in rows:
+            nominal = {"mass upper": 1.0, "mass fore": 0.6, "frictionloss elbow": FRICTION, "frictionloss shoulder": 0.0}
+            row["truth"] = nominal.get(row["parameter"], 0.01 if "armature" in row["parameter"] else 0.05)
+            row["seconds"] = round(seconds[row["method"]], 1)
+            writer.writerow({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()})
+    os.replace(temporary, options.out)
+    print(options.out.read_text())
+
+
+if __name__ == "__main__":
+    main()
