@@ -70,7 +70,8 @@ def test_the_transformers_reward_by_hand(residual):
     predicted, guess = rng.normal(size=(2, 4, 11)).astype(np.float32)
     low, high = sim.single_action_space.low, sim.single_action_space.high
     transformer = ActionTransformer(GaussianPolicy(14, 3), low, high)
-    env = ActionTransformerEnv(sim, transformer, policy_for(sim), Prophet(predicted, guess, residual), seed=3)
+    scale = rng.uniform(0.1, 2, 11)
+    env = ActionTransformerEnv(sim, transformer, policy_for(sim), Prophet(predicted, guess, residual), scale, seed=3)
     assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     sa, _ = env.reset(seed=5)
     s, _ = twin.reset(seed=5)
@@ -80,9 +81,11 @@ def test_the_transformers_reward_by_hand(residual):
         a, output = sa[:, 11:], rng.uniform(-0.3, 0.3, (4, 3))
         s, _, fell, timeout, info = twin.step(a, applied=np.clip(a + 2 * output, -1, 1))  # the range of an action is 2
         sa, reward, terminated, truncated, at_info = env.step(output)
-        expected = [-sum((float(p) - x) ** 2 for p, x in zip(predicted[i], info["next_obs"][i])) for i in range(4)]
-        if residual:
-            expected += ((predicted.astype(float) - guess) ** 2).sum(1)
+        expected = np.zeros(4)
+        for i in range(4):
+            for k in range(11):
+                expected[i] -= ((float(predicted[i, k]) - info["next_obs"][i, k]) / scale[k]) ** 2
+                expected[i] += residual * ((float(predicted[i, k]) - float(guess[i, k])) / scale[k]) ** 2
         np.testing.assert_allclose(reward, expected, rtol=1e-5, atol=1e-5)
         assert not terminated.any()  # ending an episode must never pay
         np.testing.assert_array_equal(truncated, fell | timeout)
@@ -94,7 +97,7 @@ def test_the_transformers_reward_by_hand(residual):
 def test_the_transformer_sees_the_target_policys_actions():
     sim = world("HalfCheetah-v4", n=2000)
     policy = policy_for(sim)
-    env = ActionTransformerEnv(sim, None, policy, None, seed=0)
+    env = ActionTransformerEnv(sim, None, policy, None, 1.0, seed=0)
     sa, _ = env.reset(seed=0)
     with torch.no_grad():
         z = (sa[:, 17:] - policy.mean(torch.from_numpy(sa[:, :17])).numpy()) / 0.3
@@ -132,7 +135,7 @@ def test_the_model_of_the_real_world_comes_nearer_to_it(residual):
         truth = real.step(a)[4]["next_obs"]
         miss.append(((predicted - truth) ** 2).sum(1)), miss_without.append(((sim.peek(a) - truth) ** 2).sum(1))
         np.testing.assert_array_equal(guess, sim.peek(a).astype(np.float32) if residual else s.astype(np.float32))
-    assert 0 < held_out < 0.5
+    assert held_out.shape == (4,) and (held_out > 0).all() and (held_out < 0.5).all()
     assert np.mean(miss) < 0.3 * np.mean(miss_without)
 
 
@@ -252,16 +255,19 @@ def test_one_step_errors_by_hand():
     halve = lambda obs, a: 0.5 * a
     miss, change = [], []
     for s, a, s_next in zip(tau.s.astype(float), tau.a.astype(float), tau.s_next.astype(float)):
-        miss.append(((one.predict(s[None], 0.5 * a[None])[0] - s_next) ** 2).sum())
+        miss.append((one.predict(s[None], 0.5 * a[None])[0] - s_next) ** 2)
         change.append(((0.5 * a) ** 2).sum())
-    assert one_step_error(sim, halve, tau) == pytest.approx((np.sqrt(np.mean(miss)), np.sqrt(np.mean(change))), rel=1e-6)
+    # each dimension in units of its own real step, then the RMS over dimensions
+    steps = ((tau.s_next.astype(float) - tau.s) ** 2).mean(0)
+    expected = np.sqrt((np.mean(miss, axis=0) / steps).mean())
+    assert one_step_error(sim, halve, tau) == pytest.approx((expected, np.sqrt(np.mean(change))), rel=1e-3)
     assert one_step_error(sim, identity, tau)[1] == 0
 
 
 def test_one_step_error_is_naught_in_the_same_world():
     sim = world("InvertedPendulum-v4")
     tau = rollouts(policy_for(sim), sim, 4, seed=0)[1]
-    assert one_step_error(sim, identity, tau)[0] < 1e-5  # what float32 keeps of the states
+    assert one_step_error(sim, identity, tau)[0] < 1e-4  # what float32 keeps of the states
 
 
 # --- strangers ----------------------------------------------------------------------------------------
