@@ -17,7 +17,7 @@ import shooting
 LEVEL = 1e-3  # false-alarm rate, shared between all intervals and effects
 CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the interval must explain
 QUIET = 3.0  # squared residual over the noise's, of the windows without an event, above which something else is wrong
-LONGEST = 0.7  # of a recording: what lasts longer is no event
+LONGEST = 0.6  # of a recording: what lasts longer is no event
 
 
 @dataclass

@@ -67,8 +67,9 @@ def options_of(world, recordings):
         else:
             moved = shooting.perturbed(shooting.Hypothesis(((candidate, candidate.nominal),)))[0]
             out.append(Option(candidate, tuple(m[candidate] for m in moved), True))
-            if candidate.effect.name == "mass":  # far from its nominal a mass does not act in proportion
-                out += [Option(candidate, ((factor * candidate.nominal[0],),), False) for factor in (4.0, 20.0)]
+            # far from its nominal a mass does not act in proportion; friction that sticks has no gradient at all
+            factors = {"mass": (4.0, 20.0), "contact_friction": (0.5, 0.2)}.get(candidate.effect.name, ())
+            out += [Option(candidate, ((factor * candidate.nominal[0],),), False) for factor in factors]
     return out
 
 
@@ -142,7 +143,7 @@ class Search:
         Flexible effects that can look like several simple ones (ripples, bends, gaps) come late, when those are exhausted.
         """
         options = [o for o in self.options if o.candidate not in fit.hypothesis.candidates
-                   and (late or o.linear or o.candidate.effect.simplicity < 2)]
+                   and (late or (o.linear or o.candidate.effect.simplicity < 2) and o.candidate.effect.name != "inertia")]
         plain = [o for o in options if o.linear]
         return self.scan(fit, plain + self.screened(fit, [o for o in options if not o.linear]), self.problem)
 
@@ -326,7 +327,7 @@ class Search:
                 continue
             [new] = shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4)
             needed = worth * sum(len(c.parameters) if c.effect.simplicity > 2 else 1 for c in added)
-            if 1 - new.chi2.sum() / fit.chi2.sum() < needed or not self.shared(fit, new, worth):
+            if not solid(new.hypothesis) or 1 - new.chi2.sum() / fit.chi2.sum() < needed or not self.shared(fit, new, worth):
                 continue
             p = max(self.significance(new, c)[0] for c in added)
             if p < level:
@@ -466,6 +467,11 @@ class Search:
             last = fits.pop()
             pair = last.hypothesis if last.chi2.sum() < (1 - 2 * WORTH) * small.chi2.sum() else None
         return [(f, f.hypothesis.candidates[-1]) for f in fits], pair
+
+
+def solid(hypothesis):
+    """Whether every inertia is one that a rigid body can have: no principal moment above the sum of the others."""
+    return all(2 * max(values) <= sum(values) * (1 + 1e-6) for c, values in hypothesis.effects if c.effect.name == "inertia")
 
 
 def simplicity(candidate):
