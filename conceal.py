@@ -225,7 +225,8 @@ def _item(effect, name, size, model, scale, rng):
         p = {"seconds": 0.1 * size}
     elif effect == "friction_patch":
         low = unit(0.2, 0.5)
-        p = {"friction": 1.5 * size * torque, "low": float(np.quantile(q, low)), "high": float(np.quantile(q, low + 0.3))}
+        p = {"friction": 1.5 * size * torque, "low": float(np.quantile(q, low)),
+             "high": float(np.quantile(q, low + 0.3))}
     elif effect == "periodic_torque":
         p = {"amplitude": size * torque, "hertz": unit(0.7, 4.0), "phase": unit(0, 6.28)}
     elif effect == "detent":
@@ -251,7 +252,8 @@ def _world(effect, size, sign, model, rng):
         g = 9.81 * np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
         return _place(effect, "world", "world", **dict(zip("xyz", g.tolist())))
     if effect == "wind":
-        return _place(effect, "world", "world", x=10 * size * float(np.cos(turn)), y=10 * size * float(np.sin(turn)), z=0.0)
+        return _place(effect, "world", "world", x=10 * size * float(np.cos(turn)),
+                      y=10 * size * float(np.sin(turn)), z=0.0)
     if effect == "air_drag":
         return _place(effect, "world", "world", density=float(model.opt.density * (1 + 8 * size)))
     return _place(effect, "world", "world", seconds=float(model.opt.timestep / 4))

@@ -111,7 +111,8 @@ class Real:
         mujoco.mj_resetData(self.model, self.data)
         late = [item["parameters"]["seconds"] for item in self.hidden if item["effect"] == "sensor_delay"]
         self.memory = {"lines": {}, "lags": {}, "rub": np.zeros(len(self.rubs)),
-                       "acceleration": np.zeros(self.model.nv), "past": deque(maxlen=2 + int(max(late, default=0) / self.dt))}
+                       "acceleration": np.zeros(self.model.nv),
+                       "past": deque(maxlen=2 + int(max(late, default=0) / self.dt))}
         self.put(qpos, qvel)
         mujoco.mj_forward(self.model, self.data)
 

@@ -63,25 +63,31 @@ def rates(rows):
     return [
         ("a diagnosis was made (exit status 0)", len(diagnosed), len(rows)),
         ("the seal holds", *count(rows, lambda r: r["sealed"])),
-        ("one effect that moves prediction by > 1 x noise: named or among the possible", *count(strong, lambda r: r["found"] == 1)),
+        ("one effect that moves prediction by > 1 x noise: named or among the possible",
+         *count(strong, lambda r: r["found"] == 1)),
         ("… by its first name", *count(strong, lambda r: r["first"] == 1)),
         ("… and nothing else claimed", *count(strong, lambda r: r["found"] == 1 and r["extras"] == 0)),
         ("… where it moves the contract's Error (noisy starts) by > 1 x noise: named or among the possible",
          *count(literal, lambda r: r["found"] == 1)),
-        ("one effect that moves prediction by less: a wrong name", *count(
-            [r for r in single if min(r["moved"]) <= 1], lambda r: r["extras"] > 0)),
+        ("one effect that moves prediction by less: a wrong name",
+         *count([r for r in single if min(r["moved"]) <= 1], lambda r: r["extras"] > 0)),
         ("nothing hidden: a false alarm", *count(null, lambda r: r["extras"] > 0)),
-        ("two effects, each > 1 x noise: both named or among the possible", *count(strong_pairs, lambda r: r["found"] == 2)),
+        ("two effects, each > 1 x noise: both named or among the possible",
+         *count(strong_pairs, lambda r: r["found"] == 2)),
         ("… both by first name", *count(strong_pairs, lambda r: r["first"] == 2)),
         ("… at least one of them", *count(strong_pairs, lambda r: r["found"] >= 1)),
-        ("an effect without a name (> 1 x noise): called unknown, right place, right variable", *count(unknown, lambda r: r["found"] == 1)),
-        ("… called by a catalogue name instead, unknown not among the possible", *count(unknown, confidently_wrong)),
-        ("parameters within 5 % (first name right, effect > 1 x noise)", sum(d <= 0.05 for d in deviations), len(deviations)),
+        ("an effect without a name (> 1 x noise): called unknown, right place, right variable",
+         *count(unknown, lambda r: r["found"] == 1)),
+        ("… called by a catalogue name instead, unknown not among the possible",
+         *count(unknown, confidently_wrong)),
+        ("parameters within 5 % (first name right, effect > 1 x noise)",
+         sum(d <= 0.05 for d in deviations), len(deviations)),
         ("95 % intervals hold the truth: all", *held(intervals)),
         ("… where the truth has the model's form", *held(formed)),
         ("… and its time step", *held([(r, p) for r, p in formed if r["finer"] == 1])),
         ("… and a finer one", *held([(r, p) for r, p in formed if r["finer"] > 1])),
-        ("Hopper torso +27 %, HalfCheetah torso +15 %, pendulum pole 100: named", *count(named, lambda r: r["found"] == 1)),
+        ("Hopper torso +27 %, HalfCheetah torso +15 %, pendulum pole 100: named",
+         *count(named, lambda r: r["found"] == 1)),
         ("error of corrected.xml in stock MuJoCo within 2 % of the reported one (all findings in MJCF)",
          *count([r for r in diagnosed if all(f.get("written_as", "mjcf") == "mjcf" for f in r["findings"])], agrees)),
     ]
@@ -105,7 +111,7 @@ def agrees(row):
 
 
 def confusion(rows):
-    """(truths, names, counts) of trials with at most one thing hidden: its own name where a finding has it, else the first."""
+    """(truths, names, counts) of trials with at most one thing hidden: its name where a finding has it, else the first."""
     pairs = []
     for row in rows:
         if row["kind"] not in ("single", "null", "unknown"):
@@ -158,7 +164,8 @@ def _detection_figure(rows):
                 if shift < 0:
                     axis.text(k, 1.04, f"n={len(chosen)}", ha="center", fontsize=8)
     axis.set_xticks(range(len(EDGES) - 1), [f"{a:g}–{b:g}" for a, b in zip(EDGES, EDGES[1:])])
-    axis.set(xlabel="how far the effect moves the held-out prediction, over the noise", ylabel="rate", ylim=(-0.02, 1.12))
+    axis.set(xlabel="how far the effect moves the held-out prediction, over the noise",
+             ylabel="rate", ylim=(-0.02, 1.12))
     handles = dict(zip(*axis.get_legend_handles_labels()[::-1]))              # one of each
     if handles:
         axis.legend(handles.values(), handles.keys(), loc="lower right")
@@ -169,7 +176,8 @@ def _error_figure(rows):
     figure, axis = plt.subplots(figsize=(6, 4))
     hidden = [r for r in rows if r["hidden"] and r["exit"] == "0" and np.isfinite(r["error_after"])]
     hidden.sort(key=lambda r: r["error_before"])
-    for key, mark, label in (("error_before", "C3.", "before"), ("error_after", "C0.", "after (corrected.xml, stock MuJoCo)"),
+    for key, mark, label in (("error_before", "C3.", "before"),
+                             ("error_after", "C0.", "after (corrected.xml, stock MuJoCo)"),
                              ("error_floor", "k_", "floor (the true system from the same noisy starts)")):
         axis.semilogy([r[key] for r in hidden], mark, label=label, markersize=4)
     axis.set(xlabel="trials with something hidden, by error before", ylabel="held-out error / noise")
@@ -191,7 +199,8 @@ def _interval_figure(rows):
 
 def _table(header, lines):
     cell = lambda tag, values: "".join(f"<{tag}>{html.escape(str(v))}</{tag}>" for v in values)
-    return (f"<table><tr>{cell('th', header)}</tr>" + "".join(f"<tr>{cell('td', line)}</tr>" for line in lines) + "</table>")
+    body = "".join(f"<tr>{cell('td', line)}</tr>" for line in lines)
+    return f"<table><tr>{cell('th', header)}</tr>{body}</table>"
 
 
 def _by(rows, key):
@@ -207,7 +216,8 @@ def _by(rows, key):
 def lines(rows):
     """[(what, "hits/trials", percent, Wilson interval)] as text, for the page and the terminal."""
     return [(what, f"{hits}/{trials}", f"{100 * hits / trials:.1f} %" if trials else "-",
-             "{:.1f}–{:.1f} %".format(*(100 * bound for bound in wilson(hits, trials)))) for what, hits, trials in rates(rows)]
+             "{:.1f}–{:.1f} %".format(*(100 * bound for bound in wilson(hits, trials))))
+            for what, hits, trials in rates(rows)]
 
 
 def write(table, out):
@@ -217,7 +227,8 @@ def write(table, out):
     seconds = np.array([row["cpu_seconds"] for row in rows])
     worst = [(r["trial"], r["mechanism"], "finer" if r["finer"] > 1 else "same",
               "; ".join(f"{h['effect']}@{h['place']['name']} ({m:.1f}x)" for h, m in zip(r["hidden"], r["moved"])),
-              "; ".join(f"{f['effect']}@{f['place']['name']}" for f in r["findings"]) or ("-" if r["exit"] == "0" else r["note"]))
+              "; ".join(f"{f['effect']}@{f['place']['name']}" for f in r["findings"])
+              or ("-" if r["exit"] == "0" else r["note"]))
              for r in rows if r["extras"] or r["found"] < sum(m > 1 for m in r["moved"])]
     body = [
         "<h1>Sealed blind trials of the diagnosis</h1>",
@@ -228,11 +239,14 @@ def write(table, out):
         "<h2>Detection against size</h2>", _detection_figure(rows),
         "<h2>What was hidden, what was said first</h2>", _confusion_figure(rows),
         "<h2>Held-out error</h2>", _error_figure(rows), "<h2>Intervals</h2>", _interval_figure(rows),
-        "<h2>By effect</h2>", _table(("effect", "trials", "found", "first", "false claims"), _by(rows, lambda r: r["hidden"][0]["effect"])),
-        "<h2>By mechanism</h2>", _table(("mechanism", "trials", "found", "first", "false claims"), _by(rows, lambda r: r["mechanism"])),
+        "<h2>By effect</h2>",
+        _table(("effect", "trials", "found", "first", "false claims"), _by(rows, lambda r: r["hidden"][0]["effect"])),
+        "<h2>By mechanism</h2>",
+        _table(("mechanism", "trials", "found", "first", "false claims"), _by(rows, lambda r: r["mechanism"])),
         "<h2>Every miss and every false claim</h2>",
         _table(("trial", "mechanism", "time step", "hidden (over the noise)", "findings"), worst),
-        f"<p>Named specially: {html.escape(', '.join(NAMED))}. Truth in another form than the catalogue's, left out of one line: "
+        f"<p>Named specially: {html.escape(', '.join(NAMED))}. Truth in another form than the catalogue's, left out "
+        f"of one line: "
         f"{html.escape(', '.join(FORMLESS))}.</p>"]
     style = ("body{font:16px/1.5 sans-serif;max-width:60em;margin:auto;padding:1em}img{max-width:100%}"
              "table{border-collapse:collapse;font-size:85%;display:block;overflow-x:auto}td,th{padding:.2em .6em;"

@@ -174,7 +174,8 @@ def diagnose(command, folder, limit=900):
                           env=environment, capture_output=True, text=True, stdin=subprocess.DEVNULL,
                           preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit)))
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    note = (done.stderr.strip().splitlines() or [""])[-1] if done.returncode >= 0 else f"stopped by signal {-done.returncode}"
+    note = (done.stderr.strip().splitlines() or [""])[-1]
+    note = note if done.returncode >= 0 else f"stopped by signal {-done.returncode}"
     return {"exit": done.returncode, "seconds": time.monotonic() - begun, "note": note[:300],
             "cpu_seconds": after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime}
 
@@ -324,7 +325,8 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("run", help="run sealed trials and append them to a table")
-    command.add_argument("--seed", type=int, required=True, help=f"below 1000 to develop on; {FINAL_SEED} is the final one")
+    command.add_argument("--seed", type=int, required=True,
+                         help=f"below 1000 to develop on; {FINAL_SEED} is the final one")
     command.add_argument("--trials", type=int, default=400, help="trials 0 .. N-1")
     command.add_argument("--first", type=int, default=0, help="start at this trial")
     command.add_argument("--out", required=True, help="CSV; its seals go to OUT.sealed")
