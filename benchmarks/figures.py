@@ -65,7 +65,19 @@ def table(rows, best):
             print(f"| {env} | {policy} | {algo} | {tag} | {len(last)} | {np.mean(last):.0f} ({each(last)}) | {np.median(fresh):.0f} ({each(fresh)}) | {real:.0f} |")
 
 
+def settings_table(rows):
+    """Markdown: what a frozen policy returns in the grounded simulator under each variant, and the one-step error."""
+    print("\n| method | units of R_AT | f_ψ | γ_AT | max KL | std | error of f_ψ | one-step error | return, stochastic | deterministic |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for row in rows:
+        f_error = f"{float(row['forward_model_error']):.4f}" if row["forward_model_error"] else ""
+        told = [row[k] for k in ("method", "norm", "forward_model", "at_gamma", "at_max_kl", "at_std")]
+        returns = [f"{float(row[f'return_{k}']):.0f}" for k in ("stochastic", "deterministic")]
+        print("| " + " | ".join([*told, f_error, f"{float(row['one_step_error']):.4f}", *returns]) + " |")
+
+
 if __name__ == "__main__":
+    settings_table(read("transformer_settings.csv"))
     rows, best = read("grounding.csv"), read("best.csv")
     if rows:
         draw_grounding(rows, best)
