@@ -208,6 +208,8 @@ def start(s, run, sim, real, bar):
         for step in range(1, done + 1):
             tau_real += Transitions(*run.real(step))
         bar.skip(int(run.progress[-1]["real_transitions" if s.algo == "real" else "sim_steps"]))
+        if not run.lines:
+            reference(s, run, learner, real, bar)
         bar.lap()
         return learner, grounding, tau_real
 

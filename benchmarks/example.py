@@ -65,7 +65,7 @@ def draw(rows):
     for look, force in (("nominal", before), ("corrected", after)):
         right.plot(speed, force, ".", markersize=2, alpha=0.3, color=COLOURS[look])
         right.plot(*binned(speed, force, 16), color=COLOURS[look], linewidth=1.8)
-    right.set(xlabel="elbow velocity (rad/s)", ylabel="force left over (N·m)", title="force that the models leave over", xlim=(-7, 7), ylim=(-0.45, 0.45))
+    right.set(xlabel="elbow velocity (rad/s)", ylabel="force left over (N·m)", title="force left over", xlim=(-7, 7), ylim=(-0.45, 0.45))
     os.makedirs(os.path.dirname(PICTURE), exist_ok=True)
     figure.savefig(PICTURE, dpi=110)
 
