@@ -54,11 +54,19 @@ class Step:
     ranking: list = field(default_factory=list)
 
 
+def unseen(world, place, recordings):
+    """Whether a place is a joint whose position was never measured: nothing tells where its probes should lie."""
+    if place.kind != "joint":
+        return False
+    q = world.model.jnt_qposadr[world.model.joint(place.name).id]
+    return not any(np.isfinite(r.qpos[:, q]).any() for r in recordings)
+
+
 def options_of(world, recordings):
     """Every way to try every candidate. Effects with probes of their own have no gradient at their nominal value."""
     out = []
     for candidate in world.candidates:
-        if candidate.effect.timed:
+        if candidate.effect.timed or candidate.effect.overrides("probes") and unseen(world, candidate.place, recordings):
             continue
         if candidate.effect.name == "cogging":
             candidate = rippling(world, candidate, recordings)
