@@ -31,7 +31,6 @@ class Physics(Grounding):
         except (RecordingError, ModelError) as error:
             raise EnvError(f"no diagnosis from {len(tau_real)} real transitions: {error}") from None
         self.xml = diagnosis.corrected_xml
-        self.findings = diagnosis.summary["findings"]
         return {}
 
     def update(self, policy, steps, seed, on_update=None):

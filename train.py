@@ -349,7 +349,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def parse(argv):
-    """The command line as (Settings, its explicit options, arguments of the run itself)."""
+    """The parsed command line: every field of Settings, and what to do with which run. Raises RunError where it makes no sense."""
     parser = Parser(prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for f in dataclasses.fields(Settings):
         kind = {"int": int, "float": float, "str": str}[getattr(f.type, "__name__", f.type)]
