@@ -11,7 +11,7 @@
 Held-out recordings enter only after everything is chosen and fitted.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -43,11 +43,8 @@ class Diagnosis:
     settings: dict  # {Candidate: values}
     ranking: list
     traces: list
-    residuals: list
-    advice: list
     train: list  # Recordings
     held_out: list
-    unknown_curves: list = field(default_factory=list)
 
 
 def identify(world, train, held_out, progress=None):
@@ -109,7 +106,7 @@ def searched(data, say):
         if hypothesis.effects:
             [fit] = shooting.solve(problem, [hypothesis], fit)
             fit = search.drop(fit, ())
-        fit, _ = search.run(fit)
+        fit = search.run(fit)
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     return search, fit, ranking, span
@@ -316,7 +313,7 @@ def assemble(world, train, held_out, fit, search, possible, left, event, ranking
                "unexplained": {"fraction": float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1)),
                                "place": None, "depends_on": []}}
     return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
-                     [], [], train, held)
+                     train, held)
 
 
 def event_finding(event, train):

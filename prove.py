@@ -296,6 +296,11 @@ def write(path, rows):
     os.replace(temporary, path)
 
 
+def cores():
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
 def _pin(cores):
     """Keep this worker and the diagnoses that it starts on one core, where there is more than one worker."""
     core = cores.get()
@@ -330,7 +335,7 @@ def main():
     command.add_argument("--trials", type=int, default=400, help="trials 0 .. N-1")
     command.add_argument("--first", type=int, default=0, help="start at this trial")
     command.add_argument("--out", required=True, help="CSV; its seals go to OUT.sealed")
-    command.add_argument("--jobs", type=int, default=os.cpu_count(), help="trials at once (all cores)")
+    command.add_argument("--jobs", type=int, default=cores(), help="trials at once (all cores it may use)")
     command = commands.add_parser("show", help="draw one trial again: its folder, command and answer")
     command.add_argument("--seed", type=int, required=True)
     command.add_argument("--trial", type=int, required=True)
