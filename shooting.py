@@ -157,17 +157,25 @@ def _eliminate(jacobian, damping):
 
 def fit_starts(problem, hypothesis, qpos=None, qvel=None, iterations=8):
     """Start states of all windows under one hypothesis, by Levenberg-Marquardt, damped window by window."""
-    every, settings = np.arange(len(problem.windows)), hypothesis.settings
-    qpos = problem.guess_qpos.copy() if qpos is None else qpos.copy()
-    qvel = problem.guess_qvel.copy() if qvel is None else qvel.copy()
-    residual = problem.residuals([settings] * len(every), every, qpos, qvel)
-    jacobian = problem.start_jacobians([settings] * len(every), every, qpos, qvel, residual)
+    qpos, qvel = problem.guess_qpos if qpos is None else qpos, problem.guess_qvel if qvel is None else qvel
+    return _fit_starts(problem, [hypothesis], qpos, qvel, iterations)[0]
+
+
+def _fit_starts(problem, hypotheses, qpos, qvel, iterations):
+    """Fits of several hypotheses, their parameters as they stand; start states (H * W, ...) to begin from."""
+    number = len(problem.windows)
+    which = np.tile(np.arange(number), len(hypotheses))
+    settings = [s for h in hypotheses for s in [h.settings] * number]
+    pick = lambda rows: ([settings[i] for i in rows], which[rows])
+    qpos, qvel, every = qpos.copy(), qvel.copy(), np.arange(len(which))
+    residual = problem.residuals(settings, which, qpos, qvel)
+    jacobian = problem.start_jacobians(settings, which, qpos, qvel, residual)
     damping, active = np.full(len(every), 1e-3), every
     for _ in range(iterations):
         inverse = _eliminate(jacobian[active], damping[active])
         step = np.einsum("wij,wmj,wm->wi", inverse, jacobian[active], residual[active])
         new_qpos, new_qvel = problem.moved(qpos[active], qvel[active], step)
-        new = problem.residuals([settings] * len(active), active, new_qpos, new_qvel)
+        new = problem.residuals(*pick(active), new_qpos, new_qvel)
         old_cost, new_cost = (residual[active] ** 2).sum(1), (new**2).sum(1)
         better = new_cost < old_cost
         gained = better & (old_cost - new_cost > 1e-3 * old_cost)
@@ -176,11 +184,11 @@ def fit_starts(problem, hypothesis, qpos=None, qvel=None, iterations=8):
         damping[active] = np.where(better, damping[active] / 10, damping[active] * 10)
         again = active[gained]
         if len(again):
-            jacobian[again] = problem.start_jacobians([settings] * len(again), again, qpos[again], qvel[again], residual[again])
+            jacobian[again] = problem.start_jacobians(*pick(again), qpos[again], qvel[again], residual[again])
         active = active[gained | (~better & (damping[active] < 1e3))]
         if not len(active):
             break
-    return Fit(hypothesis, qpos, qvel, residual, jacobian)
+    return [Fit(h, *(x[i * number:(i + 1) * number] for x in (qpos, qvel, residual, jacobian))) for i, h in enumerate(hypotheses)]
 
 
 # ---- hypotheses with parameters ----------------------------------------------------------------
@@ -232,6 +240,12 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
     every = np.arange(len(problem.windows))
     number = len(every)
     current = evaluate(problem, hypotheses, warm)
+    # a hypothesis so far away that it fits worse at first: its start states have to follow before its slopes mean anything
+    far = [h for h in range(len(hypotheses)) if current[h].chi2.sum() > 1.01 * warm[h].chi2.sum()]
+    if far:
+        fits = _fit_starts(problem, [hypotheses[h] for h in far], np.concatenate([warm[h].qpos for h in far]),
+                           np.concatenate([warm[h].qvel for h in far]), iterations=3)
+        current = [fits[far.index(h)] if h in far else fit for h, fit in enumerate(current)]
     damping = np.full(len(hypotheses), 1e-3)
     moving = [h for h in range(len(hypotheses))]
     for iteration in range(iterations):
