@@ -8,7 +8,6 @@ from collections import Counter
 import html
 import io
 import json
-import os
 
 import matplotlib
 matplotlib.use("Agg")
@@ -16,6 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from conceal import NAMED, seal
+from files import write_whole
 from mechanisms import UNKNOWNS
 
 EDGES = (0, 1, 3, 10, 30, 100, np.inf)               # of the effect's size over the noise
@@ -253,7 +253,4 @@ def write(table, out):
              "border-bottom:1px solid #ddd;text-align:left}")
     page = ('<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
             f"<title>Sealed blind trials</title><style>{style}</style>{''.join(body)}</html>")
-    temporary = f"{out}.new"
-    with open(temporary, "w") as file:
-        file.write(page)
-    os.replace(temporary, out)
+    write_whole(out, page)

@@ -31,6 +31,7 @@ import numpy as np
 from tqdm import tqdm
 
 from conceal import DEPENDS_ON, FINAL_SEED, conceal, seal
+from files import write_table
 from hidden import Real
 from mechanisms import MECHANISMS, UNKNOWNS
 
@@ -288,12 +289,7 @@ def read(path):
 
 def write(path, rows):
     """The whole table, sorted, at once."""
-    temporary = Path(f"{path}.new")
-    with open(temporary, "w", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        table.writerows(sorted(rows, key=lambda row: (int(row["seed"]), int(row["trial"]))))
-    os.replace(temporary, path)
+    write_table(path, COLUMNS, sorted(rows, key=lambda row: (int(row["seed"]), int(row["trial"]))))
 
 
 def cores():

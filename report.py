@@ -6,7 +6,6 @@ import html
 import json
 import math
 import os
-import tempfile
 
 import numpy as np
 
@@ -15,6 +14,7 @@ import experiments
 import leftover
 import motion
 import wording
+from files import WriteError, write_together
 from figures import Series, binned, chart, whisker
 from page import SCRIPT, STYLE
 
@@ -50,32 +50,13 @@ def write(diagnosis, out):
         lines = [f"{curve['variable']},force", *(f"{x:.9g},{force:.9g}" for x, force in rows)]
         files[f"unknown_{n}.csv"] = "\n".join(lines) + "\n"
     made = not os.path.isdir(out)
-    waiting = {}
     try:
         os.makedirs(out, exist_ok=True)
-        for name, text in files.items():
-            handle, waiting[name] = tempfile.mkstemp(prefix=f".{name}.", dir=out)
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.chmod(waiting[name], 0o666 & ~_umask())
-        for name in files:
-            os.replace(waiting[name], os.path.join(out, name))
-    except OSError as error:
-        for path in waiting.values():
-            if os.path.exists(path):
-                os.remove(path)
+        write_together({os.path.join(out, name): text for name, text in files.items()})
+    except (OSError, WriteError) as error:
         if made and os.path.isdir(out) and not os.listdir(out):
             os.rmdir(out)
-        raise ReportError(f"{out}: the report cannot be written ({error.strerror or error}); free some space or give "
-                          "another --out") from None
-
-
-def _umask():
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+        raise ReportError(f"the report is not written: {error}") from None
 
 
 def plain(value):

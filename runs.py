@@ -15,6 +15,7 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
+from files import write_table, write_whole
 from models import GaussianPolicy, load_checkpoint
 
 PROGRESS = (
@@ -30,21 +31,8 @@ class RunError(ValueError):
     """A run folder that cannot be used as asked; the message says what to do instead."""
 
 
-def write_whole(path, data):
-    """Write bytes or text under a temporary name, then rename: a reader never sees half a file."""
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with open(partial, "wb") as file:
-            file.write(data.encode() if isinstance(data, str) else data)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise RunError(f"cannot write {path}: {error.strerror}; free space or choose another --out") from None
-
-
 def save_whole(path, tensors):
-    """torch.save in the manner of write_whole."""
+    """torch.save in the manner of files.write_whole."""
     data = io.BytesIO()
     torch.save(tensors, data)
     write_whole(path, data.getvalue())
@@ -104,20 +92,13 @@ class Run:
         path = self.folder / name
         return list(csv.DictReader(path.open(newline=""))) if path.exists() else []
 
-    def _table(self, name, columns, rows):
-        text = io.StringIO()
-        writer = csv.DictWriter(text, columns, extrasaction="ignore", restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-        write_whole(self.folder / name, text.getvalue())
-
     def log_update(self, grounding_step, phase, stats):
         """Keep a row of train.csv; flush() writes it."""
         self.train.append({"grounding_step": grounding_step, "phase": phase, **stats})
 
     def flush(self):
         """Bring train.csv and the figure up to date."""
-        self._table("train.csv", TRAIN, self.train)
+        write_table(self.folder / "train.csv", TRAIN, self.train)
         self.plot()
 
     def record(self, row, checkpoint, real=None):
@@ -132,8 +113,8 @@ class Run:
         if row["real_return_deterministic"] > best:
             save_whole(self.folder / "policy.pt", checkpoint["acting"])
         self.progress.append({k: row.get(k, "") for k in PROGRESS})
-        self._table("train.csv", TRAIN, self.train)
-        self._table("progress.csv", PROGRESS, self.progress)
+        write_table(self.folder / "train.csv", TRAIN, self.train)
+        write_table(self.folder / "progress.csv", PROGRESS, self.progress)
         self.plot()
 
     def checkpoint(self, step):

@@ -20,10 +20,11 @@ import torch
 from tqdm import tqdm
 
 from envs import BatchEnv, EnvError, parse_perturbation, task_of
+from files import WriteError, write_whole
 from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint
 from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, identity, one_step_error
 from remodel import Physics
-from runs import Run, RunError, animate, save_whole, versions, write_whole
+from runs import Run, RunError, animate, save_whole, versions
 from trpo import PRESETS, TRPO, Transitions, rollouts
 from world import quiet
 
@@ -380,7 +381,7 @@ def main(argv=None):
             algorithm_1(s, run, Bar(s, run))
             print(verdict(s, run))
         return 0
-    except (EnvError, RunError) as error:
+    except (EnvError, RunError, WriteError) as error:
         print(f"train.py: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -8,8 +8,6 @@ packages (pip install "mujoco[sysid]"); without them only the diagnosis is timed
 """
 
 import argparse
-import csv
-import os
 from pathlib import Path
 import sys
 import time
@@ -21,6 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from diagnose import diagnose  # noqa: E402
+from files import write_table  # noqa: E402
 from recordings import Recording  # noqa: E402
 
 ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><default><geom contype="0" conaffinity="0"/>
@@ -99,17 +98,13 @@ def main():
         print(f"mujoco.sysid failed: {type(error).__name__}: {error}", file=sys.stderr)
     seconds["sysid"] = time.monotonic() - begun
     rows += [{"method": "sysid", "parameter": name, "value": value} for name, value in (found or {}).items()]
-    temporary = options.out.with_suffix(".tmp")
+    nominal = {"mass upper": 1.0, "mass fore": 0.6, "frictionloss elbow": FRICTION, "frictionloss shoulder": 0.0}
+    for row in rows:
+        row["truth"] = nominal.get(row["parameter"], 0.01 if "armature" in row["parameter"] else 0.05)
+        row["seconds"] = round(seconds[row["method"]], 1)
     options.out.parent.mkdir(exist_ok=True)
-    with temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ("method", "parameter", "value", "low", "high", "truth", "seconds"))
-        writer.writeheader()
-        for row in rows:
-            nominal = {"mass upper": 1.0, "mass fore": 0.6, "frictionloss elbow": FRICTION, "frictionloss shoulder": 0.0}
-            row["truth"] = nominal.get(row["parameter"], 0.01 if "armature" in row["parameter"] else 0.05)
-            row["seconds"] = round(seconds[row["method"]], 1)
-            writer.writerow({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()})
-    os.replace(temporary, options.out)
+    write_table(options.out, ("method", "parameter", "value", "low", "high", "truth", "seconds"),
+                ({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows))
     print(options.out.read_text())
 
 

@@ -7,7 +7,6 @@ Recordings are not part of this repository; what is absent is skipped. One row p
 
 import argparse
 import csv
-import os
 from pathlib import Path
 import sys
 import time
@@ -16,6 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from diagnose import diagnose  # noqa: E402
+from files import write_table  # noqa: E402
 
 BALLS = ("bowlingball", "baseball", "golfball", "volleyball", "tennisball", "whiffleball_1", "whiffleball_2", "whiffleball_orange",
          "whiffleball_yellow", "basketball_blue", "basketball_green")
@@ -66,12 +66,7 @@ def main():
         for row in new:
             print(*(row.get(k) for k in ("rig", "model", "verdict", "effect", "place", "value", "low", "high", "also_possible", "seconds")), flush=True)
         options.out.parent.mkdir(exist_ok=True)
-        temporary = options.out.with_suffix(".tmp")
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in kept)
-        os.replace(temporary, options.out)
+        write_table(options.out, COLUMNS, ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in kept))
 
 
 if __name__ == "__main__":
