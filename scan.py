@@ -218,20 +218,15 @@ class Scan:
                 break
         return out
 
-    def spread(self, trials, gram, number):
-        """The best few trials, no two of which have the same column."""
-        total, out = gram.sum(0), []
-        for t in trials:
-            for other in out:
-                if len(t.columns) == len(other.columns) == 1:
-                    i, j = t.columns[0], other.columns[0]
-                    if abs(total[i, j]) > 0.998 * np.sqrt(total[i, i] * total[j, j]):
-                        break
-            else:
-                out.append(t)
-            if len(out) == number:
-                break
-        return out
+    @staticmethod
+    def alike(one, other, gram):
+        """Whether two trials have the same column, or try the same candidate."""
+        if one.option.candidate == other.option.candidate:
+            return True
+        if not len(one.columns) == len(other.columns) == 1:
+            return False
+        total, i, j = gram.sum(0), one.columns[0], other.columns[0]
+        return abs(total[i, j]) > 0.998 * np.sqrt(total[i, i] * total[j, j])
 
     def whole(self, fit, candidate):
         """Cluster sums of the columns [other parameters..., the whole effect from fitted to absent], and chi2.

@@ -18,37 +18,44 @@ ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 
 
 class Search(Scan):
-    def run(self, fit, most=6, singles=5, doubles=2):
+    def run(self, fit, most=6):
         """Additions, drops and swaps from the nominal fit: a Fit."""
         late = False
         for _ in range(most):
             trials, gram, score, chi2 = self.trials(fit, late)
-            if not self.ranking:
-                self.ranking = trials
-            level, worth = ALPHA / self.places, self.worth(fit)
-            hopeful = [t for t in trials if t.start and t.p_value < 10 * level and t.held > 0 and t.gain > 0.3 * worth * chi2]
-            proposals = [[(t.option.candidate, t.start)] for t in self.spread(hopeful, gram, singles)]
-            best = max((t.gain for t in trials if t.start), default=0.0)
-            proposals += [list(pair) for gain, *pair in self.pairs(trials, gram, score, doubles)
-                          if gain > best + max(2 * worth * chi2, 0.1 * best)]
-            if not proposals and late:
-                break
-            if not proposals:
-                late = True
-                continue
+            self.ranking = self.ranking or trials
+            proposals = self.proposals(fit, trials, gram, score, chi2)
             hypotheses = [fit.hypothesis for _ in proposals]
             for i, proposal in enumerate(proposals):
                 for candidate, start in proposal:
                     hypotheses[i] = hypotheses[i].plus(candidate, start)
             fits = shooting.solve(self.small, hypotheses, fit.subset(self.few), iterations=4)
-            chosen = self.choose(fit, fits, proposals)
+            chosen = self.choose(fit, fits, proposals) if proposals else None
             if chosen is None and late:
                 break
-            if chosen is None:
-                late = True
-                continue
-            fit = self.drop(*chosen)
+            late = chosen is None
+            fit = fit if late else self.drop(*chosen)
         return fit
+
+    def proposals(self, fit, trials, gram, score, chi2, looks=12, singles=4, doubles=2):
+        """What to refit: [[(candidate, start)], ..., [(candidate, start), (candidate, start)], ...].
+
+        Single effects by what they leave at full size, where what is alike in a small step may differ, and no two of
+        them alike there too; pairs by the linear estimate, where it promises much more than any single effect.
+        """
+        level, worth = ALPHA / self.places, self.worth(fit)
+        hopeful = [t for t in trials if t.start and t.p_value < 10 * level and t.held > 0 and t.gain > 0.3 * worth * chi2][:looks]
+        tried = [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful]
+        left = [f.chi2.sum() for f in shooting.follow(self.small, tried, fit.subset(self.few), iterations=2)]
+        chosen = []
+        for i in sorted(range(len(left)), key=left.__getitem__):
+            rivals = [j for j in chosen if self.alike(hopeful[i], hopeful[j], gram) and left[i] > 0.9 * left[j]]
+            if len(chosen) < singles and not rivals:
+                chosen.append(i)
+        out = [[(hopeful[i].option.candidate, hopeful[i].start)] for i in chosen]
+        best = max((t.gain for t in trials if t.start), default=0.0)
+        return out + [list(pair) for gain, *pair in self.pairs(trials, gram, score, doubles)
+                      if gain > best + max(2 * worth * chi2, 0.1 * best)]
 
     def choose(self, fit, fits, proposals):
         """The hypothesis that wins, refitted to all windows, as (Fit, added candidates); None when none earns its keep."""
@@ -83,18 +90,27 @@ class Search(Scan):
         return sum(after[o] for o in after if o != best) < (1 - 0.3 * worth) * sum(before[o] for o in before if o != best)
 
     def drop(self, fit, added):
-        """Leave out earlier effects that no longer earn their keep."""
+        """Leave out earlier effects that no longer earn their keep, now that the others may take their part."""
         while True:
             earlier = {c: self.significance(fit, c) for c in fit.hypothesis.candidates if c not in added}
-            worth = self.worth(fit)
-            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * worth or p > ALPHA / self.places]
-            if not weak:
+            worth, level = self.worth(fit), ALPHA / self.places
+            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * worth or p > level]
+            for candidate in sorted(weak, key=lambda c: earlier[c][1]):
+                less = self.without(fit, candidate)
+                if less.chi2.sum() < (1 + worth * (1 if earlier[candidate][0] < level else 3)) * fit.chi2.sum():
+                    fit = less
+                    break
+            else:
                 return fit
-            weakest = min(weak, key=lambda c: earlier[c][1])
-            [less] = shooting.solve(self.problem, [fit.hypothesis.minus(weakest)], fit, iterations=4)
-            if less.chi2.sum() > (1 + worth) * fit.chi2.sum() and earlier[weakest][0] <= ALPHA / self.places:
-                return fit
-            fit = less
+
+    def without(self, fit, candidate):
+        """A fit with a candidate left out; what then has to go far away may begin there."""
+        less = fit.hypothesis.minus(candidate)
+        both = {o.candidate for o in self.options if o.linear} & set(less.candidates)
+        far = [less.plus(o.candidate, o.directions[0]) for o in self.options if not o.linear and o.candidate in both]
+        few = shooting.solve(self.small, [less] + far, fit.subset(self.few), iterations=4)
+        best = min(few, key=lambda f: f.chi2.sum())
+        return shooting.solve(self.problem, [best.hypothesis], fit, iterations=4)[0]
 
     def settle(self, fit):
         """Name every effect by the best that can stand in its place, the simplest where several do as well.

@@ -161,6 +161,14 @@ def fit_starts(problem, hypothesis, qpos=None, qvel=None, iterations=8):
     return _fit_starts(problem, [hypothesis], qpos, qvel, iterations)[0]
 
 
+def follow(problem, hypotheses, warm, iterations):
+    """Fits of hypotheses as they stand, whose start states follow from those of warm (a Fit, or one for each)."""
+    if not hypotheses:
+        return []
+    warm = warm if isinstance(warm, list) else [warm] * len(hypotheses)
+    return _fit_starts(problem, hypotheses, np.concatenate([f.qpos for f in warm]), np.concatenate([f.qvel for f in warm]), iterations)
+
+
 def _fit_starts(problem, hypotheses, qpos, qvel, iterations):
     """Fits of several hypotheses, their parameters as they stand; start states (H * W, ...) to begin from."""
     number = len(problem.windows)
@@ -242,10 +250,8 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
     current = evaluate(problem, hypotheses, warm)
     # a hypothesis so far away that it fits worse at first: its start states have to follow before its slopes mean anything
     far = [h for h in range(len(hypotheses)) if current[h].chi2.sum() > 1.01 * warm[h].chi2.sum()]
-    if far:
-        fits = _fit_starts(problem, [hypotheses[h] for h in far], np.concatenate([warm[h].qpos for h in far]),
-                           np.concatenate([warm[h].qvel for h in far]), iterations=3)
-        current = [fits[far.index(h)] if h in far else fit for h, fit in enumerate(current)]
+    for h, fit in zip(far, follow(problem, [hypotheses[h] for h in far], [warm[h] for h in far], iterations=3)):
+        current[h] = fit
     damping = np.full(len(hypotheses), 1e-3)
     moving = [h for h in range(len(hypotheses))]
     for iteration in range(iterations):
