@@ -12,7 +12,7 @@ from effects import runge_kutta
 from signals import Signal
 from surroundings import touchable
 
-COPY_BYTES = 50e6  # of edited models kept for the next call
+COPY_BYTES = 50e6  # of edited models, and of sampled controls, kept for the next call
 ROTATES = 1        # body_simple of a simple body with rotations; one that only slides is 2
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
@@ -61,6 +61,7 @@ class Working:
             self.v += range(m.jnt_dofadr[k], m.jnt_dofadr[k] + {FREE: 6, BALL: 3}.get(kind, 1))
         self.data = mujoco.MjData(m)
         self.copies, self.most_copies = OrderedDict(), max(64, int(COPY_BYTES / mujoco.mj_sizeModel(m)))
+        self.controls, self.control_bytes = OrderedDict(), 0
 
     def edited(self, items, step):
         """A copy of the model with the effects of items, or None if MuJoCo refuses it."""
@@ -92,30 +93,40 @@ class Working:
                     changed.setdefault(candidate.place.name, []).append((candidate.effect, values))
                 i = candidate.effect.id(self.model, candidate.place.name)
                 candidate.effect.push(qfrc, xfrc, self.model, i, values)
-            changed = {name: tuple(effects) for name, effects in changed.items()}
+            changed = tuple((name, tuple(effects)) for name, effects in changed.items())
             memo[key] = self.edited(items, step), qfrc, xfrc, changed
         model, qfrc, xfrc, changed = memo[key]
+        return Drive(model, self.control(recording, start, step, count, changed), qfrc, xfrc, items)
+
+    def control(self, recording, start, step, count, changed=()):
+        """What the actuators see in `count` steps from time `start`, (count, nu), kept for the next call.
+
+        changed: ((actuator, ((effect, values), ...)), ...), the effects on the way to them.
+        """
+        key = id(recording), start, step, count, changed
+        if key in self.controls:
+            self.controls.move_to_end(key)
+            return self.controls[key][0]
         m, average = self.nominal, runge_kutta(self.nominal)
-        key = id(recording), start
-        if key not in memo:
-            memo[key] = np.zeros((count, m.nu))
-            for a in range(m.nactuator):
-                for u in range(m.actuator_ctrladr[a], m.actuator_ctrladr[a] + m.actuator_ctrlnum[a]):
-                    memo[key][:, u] = self.signal(recording, a, u).sample(start, step, count, average)
-        ctrl = memo[key]
         if changed:
-            ctrl = ctrl.copy()
-            for name, effects in changed.items():
+            ctrl = self.control(recording, start, step, count).copy()
+            for name, effects in changed:
                 a = m.actuator(name).id
                 u = m.actuator_ctrladr[a]
-                key = id(recording), start, u, effects
-                if key not in memo:
-                    signal = self.signal(recording, a, u)
-                    for effect, values in effects:
-                        signal = effect.command(signal, m, a, values)
-                    memo[key] = signal.sample(start, step, count, average)
-                ctrl[:, u] = memo[key]
-        return Drive(model, ctrl, qfrc, xfrc, items)
+                signal = self.signal(recording, a, u)
+                for effect, values in effects:
+                    signal = effect.command(signal, m, a, values)
+                ctrl[:, u] = signal.sample(start, step, count, average)
+        else:
+            ctrl = np.zeros((count, m.nu))
+            for a in range(m.nactuator):
+                for u in range(m.actuator_ctrladr[a], m.actuator_ctrladr[a] + m.actuator_ctrlnum[a]):
+                    ctrl[:, u] = self.signal(recording, a, u).sample(start, step, count, average)
+        self.controls[key] = ctrl, recording  # which keeps its id from being given away
+        self.control_bytes += ctrl.nbytes
+        while self.control_bytes > COPY_BYTES and len(self.controls) > 1:
+            self.control_bytes -= self.controls.popitem(last=False)[1][0].nbytes
+        return ctrl
 
     def signal(self, recording, a, u):
         """The nominal Signal of control u of actuator a."""
