@@ -16,6 +16,7 @@ import scores
 import shooting
 
 WORTH, WORTH_MISFIT = 0.03, 0.1  # least fall of the squared residual that an effect must bring; where it is far above the noise
+PROMISING = 12  # options, at least, that are looked at anew after every addition
 FEW = 16  # windows, at least, of a refit that only has to tell hypotheses apart
 
 
@@ -99,15 +100,26 @@ class Scan:
         self.few_labels = np.unique(by_window[self.few].ravel(), return_inverse=True)[1]
         self.scout_labels = np.unique(by_window[self.scouts].ravel(), return_inverse=True)[1]
         self.ranking, self.kept = [], set()
+        self.looked = {}  # {option: (fit, its columns there)}
 
     def worth(self, fit):
         """Least fall of the squared residual: more where no hypothesis comes near the noise, and small gains mean little."""
         return WORTH if fit.chi2.sum() < 4 * self.problem.rows else WORTH_MISFIT
 
-    def reduced(self, fit, settings, problem):
-        """Cluster sums (C, k, k), (C, k) of columns with start states and the fit's own parameters projected out; chi2."""
+    def reduced(self, fit, options, problem):
+        """Cluster sums (C, k, k), (C, k) of columns with start states and the fit's own parameters projected out; chi2.
+
+        Columns over all windows are kept: those of the same fit are not simulated again.
+        """
         base, moves = shooting.perturbed(fit.hypothesis)
-        slope = shooting.columns(problem, [fit], [base + settings])[0]
+        kept = self.looked if problem is self.problem else {}
+        new = [o for o in options if o not in kept]
+        settings = [fit.hypothesis.plus(o.candidate, d).settings for o in new for d in o.directions]
+        slope, at = shooting.columns(problem, [fit], [base + settings])[0], len(base)
+        for o in new:
+            kept[o] = fit, slope[..., at:at + len(o.directions)]
+            at += len(o.directions)
+        slope = np.concatenate([slope[..., :len(base)], *(kept[o][1] for o in options)], -1)
         scan = shooting.project(problem, fit, slope, self.pieces)
         labels = {id(self.problem): self.labels, id(self.small): self.few_labels, id(self.scouting): self.scout_labels}[id(problem)]
         gram, score = scores.summed(labels, scan.gram), scores.summed(labels, scan.score)
@@ -138,8 +150,13 @@ class Scan:
         """
         options = [o for o in self.options if o.candidate not in fit.hypothesis.candidates
                    and (late or (o.linear or o.candidate.effect.simplicity < 2) and o.candidate.effect.name != "inertia")]
-        plain = [o for o in options if o.linear]
-        return self.scan(fit, plain + self.screened(fit, [o for o in options if not o.linear]), self.problem)
+        options = [o for o in options if o.linear] + self.screened(fit, [o for o in options if not o.linear])
+        # an option that promises little with the columns it had at an earlier fit is not simulated anew at this one
+        older = [o for o in options if o in self.looked and self.looked[o][0] is not fit]
+        for rank, t in enumerate(self.scan(fit, older, self.problem)[0] if older else []):
+            if rank < PROMISING or t.gain > WORTH / 4 * t.chi2:
+                del self.looked[t.option]
+        return self.scan(fit, options, self.problem)
 
     def screened(self, fit, options, most=12):
         """The most promising of the many probes of effects without gradient, looked at in few windows."""
@@ -154,11 +171,11 @@ class Scan:
         return out
 
     def scan(self, fit, options, problem):
-        settings, where = [], []
+        where, at = [], 0
         for option in options:
-            where.append(range(len(settings), len(settings) + len(option.directions)))
-            settings += [fit.hypothesis.plus(option.candidate, d).settings for d in option.directions]
-        gram, score, chi2 = self.reduced(fit, settings, problem)
+            where.append(range(at, at + len(option.directions)))
+            at += len(option.directions)
+        gram, score, chi2 = self.reduced(fit, options, problem)
         own = np.einsum("ckk->k", gram)
         out = []
         for option, mine in zip(options, where):
