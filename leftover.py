@@ -7,14 +7,16 @@ For pictures and for plausibility checks; the diagnosis itself never differentia
 import mujoco
 import numpy as np
 
+from effects import HINGE, SLIDE
+
 HALF = 0.03  # s: half width of the parabolas that smooth the positions
 
 
-def smooth(recording, most):
-    """Local parabolas at up to `most` rows: time (n,), positions, velocities, accelerations (n, nq), and the mean control
-    (n, nu) beside them. Rows near unmeasured ones are left out. For hinges and slides only."""
+def smooth(model, recording, most, seconds=HALF):
+    """Local parabolas over ± `seconds` at up to `most` rows: time (n,), qpos (n, nq), qvel, qacc (n, nv), and the mean
+    control (n, nu) beside them. Rows near unmeasured ones are left out."""
     time, rows = recording.time, len(recording.time)
-    half = max(3, int(round(HALF / np.median(np.diff(time)))))
+    half = max(3, int(round(seconds / np.median(np.diff(time)))))
     centres = np.unique(np.linspace(half, rows - half - 1, most).astype(int)) if rows > 2 * half + 1 else []
     found = []
     for centre in centres:
@@ -22,8 +24,13 @@ def smooth(recording, most):
         if np.isnan(recording.qpos[near]).any():
             continue
         t = time[near] - time[centre]
-        fit = np.linalg.lstsq(np.stack([np.ones_like(t), t, t * t / 2], axis=1), recording.qpos[near], rcond=None)[0]
-        found.append((time[centre], *fit, recording.ctrl[near.start:near.stop - 1].mean(axis=0)))
+        away = np.empty((len(t), model.nv))  # from the centre; its derivatives there are velocity and acceleration
+        for row, qpos in zip(away, recording.qpos[near]):
+            mujoco.mj_differentiatePos(model, row, 1.0, recording.qpos[centre], qpos)
+        here, speed, acceleration = np.linalg.lstsq(np.stack([np.ones_like(t), t, t * t / 2], axis=1), away, rcond=None)[0]
+        qpos = recording.qpos[centre].copy()
+        mujoco.mj_integratePos(model, qpos, here, 1.0)
+        found.append((time[centre], qpos, speed, acceleration, recording.ctrl[near.start:near.stop - 1].mean(axis=0)))
     return [np.array(x) for x in zip(*found)] if found else [np.empty(0)] + [np.empty((0, 0))] * 4
 
 
@@ -45,9 +52,9 @@ def residuals(diagnosis, most=1200):
     nominal = diagnosis.world.model
     corrected = mujoco.MjModel.from_xml_string(diagnosis.corrected_xml)
     measured = [r for r in diagnosis.held_out if not np.isnan(r.qpos).all(axis=0).any()]
-    if nominal.nq != nominal.nv or nominal.na or not measured:
+    if nominal.na or not measured:
         return []
-    time, *states = (np.concatenate(x) for x in zip(*(smooth(r, most // len(measured) + 1) for r in measured)))
+    time, *states = (np.concatenate(x) for x in zip(*(smooth(nominal, r, most // len(measured) + 1) for r in measured)))
     if len(time) < 50:
         return []
     before = forces(nominal, *states)
@@ -60,8 +67,8 @@ def residuals(diagnosis, most=1200):
             joint = _joint_of(nominal, finding["place"], joint)
             if x is None or joint is None:
                 continue
-            hinge = nominal.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-            found.append({"finding": index, "variable": variable, "x": x, "before": before[:, joint], "after": after[:, joint],
+            hinge, dof = nominal.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE, nominal.jnt_dofadr[joint]
+            found.append({"finding": index, "variable": variable, "x": x, "before": before[:, dof], "after": after[:, dof],
                           "unit": "N·m" if hinge else "N", "x_unit": unit, "joint": nominal.joint(joint).name or str(joint)})
     return found
 
@@ -73,9 +80,10 @@ def _variable(model, variable, time, qpos, qvel, qacc, ctrl):
         return time, None, "s"
     if kind in ("position", "velocity"):
         joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-        if joint >= 0:
+        if joint >= 0 and model.jnt_type[joint] in (HINGE, SLIDE):
             length = "rad" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE else "m"
-            return (qpos[:, joint], joint, length) if kind == "position" else (qvel[:, joint], joint, length + "/s")
+            q, v = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+            return (qpos[:, q], joint, length) if kind == "position" else (qvel[:, v], joint, length + "/s")
     if kind == "control":
         actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
         if actuator >= 0:

@@ -17,6 +17,18 @@ import numpy as np
 LARGEST_NPZ = 4 << 30  # bytes unpacked: a small archive can claim to hold terabytes
 WIDTHS = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}  # (qpos, qvel); others (1, 1)
 
+PACKED = (  # first bytes of a file, what it is, what to do
+    (b"\x1f\x8b", "compressed with gzip", "unpack it first (gunzip)"),
+    (b"BZh", "compressed with bzip2", "unpack it first (bunzip2)"),
+    (b"\xfd7zXZ", "compressed with xz", "unpack it first (unxz)"),
+    (b"7z\xbc\xaf", "a 7z archive", "unpack it first"),
+    (b"\x89HDF", "an HDF5 file", "convert it to CSV or NPZ, or name the folder if it is a Minari dataset"),
+    (b"MATLAB 5", "a MATLAB file", "export the variables as CSV"),
+    (b"\x93NUMPY", "a single NumPy array", "save time, qpos and ctrl together with numpy.savez"),
+    (b"PAR1", "a Parquet file", "export it as CSV"),
+    (b"SQLite", "a database", "export the topics as CSV"),
+    (b"#ROSBAG", "a ROS bag", "export the topics as CSV"))
+
 
 class RecordingError(ValueError):
     """A recording cannot be used. One line: the file, the column, the row, and what to do."""
@@ -43,9 +55,13 @@ def read(path, model):
         raise RecordingError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     if not data.strip():
         raise RecordingError(f"{path}: the file is empty; record again or leave it out")
+    for start, what, do in PACKED:
+        if data.startswith(start):
+            raise RecordingError(f"{path}: {what}; {do}")
     if path.lower().endswith(".npz") or data[:4] == b"PK\x03\x04":
         return [(path, os.path.basename(path), _npz(path, data, model), 0)]
-    return [(path, os.path.basename(path), _csv(path, data, model), 2)]  # as an editor counts: the header is row 1
+    first_row, columns = _csv(path, data, model)
+    return [(path, os.path.basename(path), columns, first_row)]
 
 
 # --- columns: what the model calls them -----------------------------------------------------------------------------
@@ -136,7 +152,7 @@ def _unknown(name, known, model):
 # --- CSV ------------------------------------------------------------------------------------------------------------
 
 def _csv(path, data, model):
-    """{column name: (T,) float64} of a CSV file."""
+    """(first row, {column name: (T,) float64}) of a CSV file, rows as an editor counts them: the header is row 1."""
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise RecordingError(f"{path}: written as UTF-16; save it as UTF-8 CSV")
     if b"\x00" in data:
@@ -147,17 +163,18 @@ def _csv(path, data, model):
         row = data.count(b"\n", 0, error.start) + 1
         raise RecordingError(f"{path}: row {row}: not UTF-8 text; save the file as UTF-8 CSV") from None
     text = text.replace("\r\n", "\n").replace("\r", "\n")
-    first, _, body = text.partition("\n")
+    above, first, body = _header_line(text)
     try:
         header = next(csv.reader([first], strict=True), [])
     except csv.Error as error:
-        raise RecordingError(f"{path}: row 1: the header cannot be read ({error}); write plain column names") from None
+        raise RecordingError(f"{path}: row {above + 1}: the header cannot be read ({error}); write plain column names") from None
     if "time" not in [cell.strip() for cell in header]:
-        for mark, name in ((";", "semicolons"), ("\t", "tabs")):
-            if mark in first:
-                raise RecordingError(f"{path}: row 1: columns are separated by {name}; separate them by commas")
+        for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars"), (" ", "spaces")):
+            if "time" in [cell.strip(' "') for cell in first.split(mark)]:
+                raise RecordingError(f"{path}: row {above + 1}: columns are separated by {name}; separate them by commas")
         if all(_number(cell) is not None for cell in header):
-            raise RecordingError(f"{path}: row 1: no header; the first line must name the columns (time,qpos:<joint>,...)")
+            raise RecordingError(f"{path}: row {above + 1}: no header; the first line must name the columns "
+                                 "(time,qpos:<joint>,...)")
     names = _resolve(path, header, model)
     if not body.strip():
         raise RecordingError(f"{path}: a header and no rows; record again or leave it out")
@@ -168,20 +185,31 @@ def _csv(path, data, model):
         if table.shape[1] != len(names):
             raise ValueError
     except (ValueError, OverflowError):  # something is odd: read it slowly, to say where, or to accept empty cells
-        table = _slow(path, body, names)
-    return dict(zip(names, table.T))
+        table = _slow(path, body, names, above + 2)
+    return above + 2, dict(zip(names, table.T))
 
 
-def _slow(path, body, names):
+def _header_line(text):
+    """(lines above it, the header, all that follows): comments may stand above, and numpy.savetxt writes "# time,...". """
+    above, rest = 0, text
+    while True:
+        first, _, rest = rest.partition("\n")
+        bare = first.lstrip("# \t")
+        if not first.startswith("#") or "time" in [cell.strip() for cell in bare.split(",")]:
+            return above, bare if first.startswith("#") else first, rest
+        above += 1
+
+
+def _slow(path, body, names, first_row):
     """(T, columns) of a CSV body cell by cell: empty cells are NaN, anything else odd raises RecordingError."""
     rows = []
     lines = body.rstrip().split("\n")
-    for row, line in enumerate(lines, start=2):
+    for row, line in enumerate(lines, start=first_row):
         if not line.strip():
             raise RecordingError(f"{path}: row {row}: an empty line inside the recording; remove it")
         cells = [cell.strip().strip('"') for cell in line.split(",")]
         if len(cells) != len(names):
-            why = (" (is the file cut off?)" if row == len(lines) + 1 else
+            why = (" (is the file cut off?)" if row == len(lines) + first_row - 1 else
                    " (is a decimal comma used?)" if len(cells) > len(names) else "")
             raise RecordingError(f"{path}: row {row}: {len(cells)} cells where the header has {len(names)}; repair the "
                                  f"row{why}")
@@ -209,6 +237,8 @@ def _npz(path, data, model):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(member.file_size for member in archive.infolist()) > LARGEST_NPZ:
                 raise RecordingError(f"{path}: unpacks to more than {LARGEST_NPZ >> 30} GiB; split the recording")
+            if "[Content_Types].xml" in archive.namelist():
+                raise RecordingError(f"{path}: an Excel workbook; save the sheet as CSV")
         arrays = {}
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             for key in archive.files:

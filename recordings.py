@@ -131,10 +131,10 @@ def check(recordings, model):
     Raises RecordingError where the evidence is beyond doubt (a time in ms, a joint in degrees, swapped columns, a gap,
     nothing that moves) since a diagnosis would then describe the mistake and not the machine.
     """
-    found = {}  # message -> names of the recordings it holds for
+    found = {}  # message -> [(recording's name, share of its rows)] of those it holds for
 
-    def warn(recording, message):
-        found.setdefault(message, []).append(recording.name)
+    def warn(recording, message, share=None):
+        found.setdefault(message, []).append((recording.name, share))
 
     for recording in recordings:
         _check_time(recording, model, warn)
@@ -143,6 +143,7 @@ def check(recordings, model):
     moving = [recording for recording in recordings if _moves(recording)]
     everything = recordings[0].name + _more(recordings)
     rows, seconds = sum(len(r.time) for r in moving), sum(r.time[-1] - r.time[0] for r in moving)
+    _check_copies(moving)
     if not moving:
         raise RecordingError(f"{everything}: not enough data: nothing moves beyond the sensors' noise; move every joint of "
                              f"interest ({ENOUGH})")
@@ -156,11 +157,27 @@ def check(recordings, model):
         doubt = suspect(recording, model)
         if doubt:
             raise RecordingError(f"{recording.name}: {doubt}")
-    return [f"{names[0]}{_more(names)}: {message}" for message, names in found.items()]
+    return [f"{places[0][0]}{_more(places)}: {message.replace('{}', _share(places))}" for message, places in found.items()]
 
 
-def _more(names):
-    return f" and {len(names) - 1} more" if len(names) > 1 else ""
+def _more(places):
+    return f" and {len(places) - 1} more" if len(places) > 1 else ""
+
+
+def _share(places):
+    """The share of rows that a warning concerns, in words: the largest of its recordings."""
+    largest = max(share or 0 for _, share in places)
+    return "less than 1 %" if largest < 0.01 else f"{'up to ' if len(places) > 1 else ''}{100 * largest:.0f} %"
+
+
+def _check_copies(recordings):
+    """Raises RecordingError where two recordings are the same: one would be judged by its own copy."""
+    known = {}
+    for recording in recordings:
+        content = recording.qpos.tobytes(), recording.ctrl.tobytes()
+        if content in known:
+            raise RecordingError(f"{recording.name}: holds the same rows as {known[content]}; give it once")
+        known[content] = recording.name
 
 
 def _moves(recording):
@@ -212,10 +229,8 @@ def _check_values(recording, model, warn):
         where = f"{recording.name}: column {column!r}"
         missing = np.isnan(values)
         if missing.any():
-            share = 100 * missing.mean()
-            warn(recording, f"{column} is not measured" if missing.all() else
-                 f"{column} has nan in {share:.0f} % of its rows" if share >= 1 else
-                 f"{column} has nan in {missing.sum()} rows")
+            what = "is not measured" if missing.all() else "has nan in {} of its rows"
+            warn(recording, f"{column} {what}", missing.mean())
             values = values[~missing]
         if len(values) < 2:
             continue
@@ -252,8 +267,8 @@ def _check_values(recording, model, warn):
         for edge, share in kept.items():
             at_range = kind == "ctrl" and limited and abs(edge - span[int(edge == high)]) < 1e-6 * (1 + abs(edge))
             if share > 0.03 and not switched and (at_range or (edge if kind == "qpos" else low == -high)):
-                warn(recording, f"{column} stays at its extreme {edge:g} in {100 * share:.0f} % of the rows: "
-                     + ("saturated at ctrlrange" if at_range else "saturated" if kind == "ctrl" else "clipped, or at a stop"))
+                why = "saturated at ctrlrange" if at_range else "saturated" if kind == "ctrl" else "clipped, or at a stop"
+                warn(recording, f"{column} stays at its extreme {edge:g} in {{}} of the rows: {why}", share)
 
 
 def _check_rates(recording, model, warn):

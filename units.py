@@ -1,68 +1,126 @@
-"""Does a recording make sense to the model in another unit, or with two columns exchanged, and only then?
+"""Does a recording make sense to the model in another unit, turned round, or with columns exchanged, and only then?
 
-The test is Newton's second law, M(q) a = F(q, v, ctrl), on smoothed positions. A mistake of unit (57 times, 1000 times)
-or of column leaves the two sides unrelated, whatever small physics the model lacks; the right reading relates them.
+The test is Newton's second law, M(q) a = F(q, v, ctrl), on smoothed positions. A mistake of unit (57 times, 1000 times),
+of sign or of column leaves the two sides unrelated, whatever small physics the model lacks; the right reading relates them.
 """
+from dataclasses import replace
+from typing import NamedTuple
+
 import mujoco
 import numpy as np
 
 import leftover
+from effects import HINGE, SLIDE
 
 CENTRES = 400  # rows at which the law is tested
+HALVES = leftover.HALF, 4 * leftover.HALF  # s, of the smoothing: for fast motion, and for slow motion under much noise
 UNLIKE = 0.35  # imbalance (0: the law holds, 1: one side dwarfs the other) above which a reading can be wrong;
-UNIT_GAIN, SWAP_GAIN = 2, 3  # the right one divides it by so much
+UNIT_GAIN, SWAP_GAIN, LIKE = 2, 3, 0.1  # the right one divides it by so much, and leaves or makes it small in the other dofs
 # (missing friction alone reaches 0.7, but no wrong reading betters that so)
+WIDE = 3.0  # degrees or mm: who records a joint in these moves it farther; one that sticks would look like one in degrees
+FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+
+
+class Reading(NamedTuple):
+    """Another way to read a recording: what to tell, the dofs whose imbalance must fall, by how much, and the states."""
+    message: str
+    dofs: list
+    gain: float
+    states: tuple
 
 
 def suspect(recording, model):
-    """One line that says which unit or columns seem wrong, or None. Silent for models with free or ball joints,
-    actuator states or joints that were not measured."""
-    if model.nq != model.nv or model.na or model.nq == 0 or np.isnan(recording.qpos).all(axis=0).any():
+    """One line that says which unit, sign or columns seem wrong, or None. Silent for models with actuator states or joints
+    that were not measured, and where contacts act."""
+    if model.na or model.nq == 0 or np.isnan(recording.qpos).all(axis=0).any():
         return None
-    states = leftover.smooth(recording, CENTRES)[1:]
-    if len(states[0]) < 20:
-        return None
-    now = _imbalance(model, *states)
-    if not (now > UNLIKE).any():
-        return None
-    readings = []  # (what to tell, joints it concerns, by how much it must be better, reading)
-    joints = range(model.nv)
-    names = [model.joint(j).name or str(j) for j in joints]
-    units = [("degrees; convert to rad", np.pi / 180) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
-             else ("mm; convert to m", 1e-3) for j in joints]
-    for j in joints:
-        scale = np.ones(model.nv)
-        scale[j] = units[j][1]
-        readings.append((f"column 'qpos:{names[j]}' seems to be in {units[j][0]}", [j], UNIT_GAIN, _scaled(states, scale, 1)))
-    if model.nv > 1:
-        readings.append(("the positions seem to be in " + " or ".join(sorted({unit for unit, _ in units})), list(joints), UNIT_GAIN,
-                         _scaled(states, np.array([factor for _, factor in units]), 1)))
-    readings.append(("column 'time' seems to be in ms; convert to s", list(joints), UNIT_GAIN,
-                     _scaled(states, np.ones(model.nv), 1e-3)))
-    for i in joints:
-        for j in range(i):
+    for half in HALVES:
+        states = leftover.smooth(model, recording, CENTRES, half)[1:]
+        if len(states[0]) < 20:
+            continue
+        now = _imbalance(model, *states)
+        if not (now > UNLIKE).any():
+            continue
+        for reading in _readings(recording, model, states, half):
+            before = now[reading.dofs]
+            if (before > UNLIKE).any():
+                bound = np.where(before > UNLIKE, before / reading.gain, np.maximum(before, LIKE))
+                if (_imbalance(model, *reading.states)[reading.dofs] < bound).all():
+                    return reading.message
+    return None
+
+
+def _readings(recording, model, states, half):
+    """Every Reading worth a try, one after the other."""
+    names = [model.joint(j).name or str(j) for j in range(model.njnt)]
+    single = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
+    free = [j for j in range(model.njnt) if model.jnt_type[j] == FREE]
+    q, v = model.jnt_qposadr, model.jnt_dofadr
+    units = {j: ("degrees; convert to rad", np.pi / 180) if model.jnt_type[j] == HINGE else ("mm; convert to m", 1e-3)
+             for j in single}
+    wide = [j for j in single if np.ptp(states[0][:, q[j]]) > WIDE]
+    for j in wide:
+        yield Reading(f"column 'qpos:{names[j]}' seems to be in {units[j][0]}", [v[j]], UNIT_GAIN,
+                      _scaled(model, states, {j: units[j][1]}))
+    if len(single) > 1 and wide:
+        yield Reading("the positions seem to be in " + " or ".join(sorted({unit for unit, _ in units.values()})),
+                      [v[j] for j in single], UNIT_GAIN, _scaled(model, states, {j: factor for j, (_, factor) in units.items()}))
+    for j in free:
+        yield Reading(f"columns 'qpos:{names[j]}:0' to ':2' seem to be in mm; convert to m", list(range(v[j], v[j] + 3)),
+                      UNIT_GAIN, _scaled(model, states, {j: 1e-3}))
+    yield Reading("column 'time' seems to be in ms; convert to s", list(range(model.nv)), UNIT_GAIN,
+                  (states[0], states[1] * 1e3, states[2] * 1e6, states[3]))
+    for j in single:
+        yield Reading(f"column 'qpos:{names[j]}' seems to have the wrong sign; turn it round", [v[j]], SWAP_GAIN,
+                      _scaled(model, states, {j: -1.0}))
+    driving, signs = [a for a in range(model.nu) if _driven(model, a)], 1.0 - 2.0 * np.eye(model.nu)
+    controls = [f"ctrl:{model.actuator(a).name or a}" for a in range(model.nu)]
+    for a in driving:
+        yield Reading(f"column '{controls[a]}' seems to have the wrong sign; turn it round", _driven(model, a), SWAP_GAIN,
+                      (*states[:3], states[3] * signs[a]))
+    for a in driving:
+        j = model.actuator_trnid[a, 0]
+        if j in single:
+            yield Reading(f"columns 'qpos:{names[j]}' and '{controls[a]}' do not fit the signs of the others; turn both round, "
+                          "or that joint's axis in the model", _driven(model, a), SWAP_GAIN,
+                          (*_scaled(model, states, {j: -1.0})[:3], states[3] * signs[a]))
+    for i in single:
+        for j in single[:single.index(i)]:
             if model.jnt_type[i] == model.jnt_type[j]:
-                order = np.arange(model.nv)
-                order[[i, j]] = j, i
-                readings.append((f"columns 'qpos:{names[j]}' and 'qpos:{names[i]}' seem to be exchanged", [i, j], SWAP_GAIN,
-                                 (*(x[:, order] for x in states[:3]), states[3])))
+                places, dofs = np.arange(model.nq), np.arange(model.nv)
+                places[[q[i], q[j]]], dofs[[v[i], v[j]]] = places[[q[j], q[i]]], dofs[[v[j], v[i]]]
+                yield Reading(f"columns 'qpos:{names[j]}' and 'qpos:{names[i]}' seem to be exchanged", [v[i], v[j]], SWAP_GAIN,
+                              (states[0][:, places], states[1][:, dofs], states[2][:, dofs], states[3]))
     for i in range(model.nu):
         for j in range(i):
             order = np.arange(model.nu)
             order[[i, j]] = j, i
-            driven = [model.actuator_trnid[a, 0] for a in (i, j) if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT]
-            readings.append((f"columns 'ctrl:{model.actuator(j).name or j}' and 'ctrl:{model.actuator(i).name or i}' seem to be "
-                             "exchanged", driven, SWAP_GAIN, (*states[:3], states[3][:, order])))
-    for message, concerned, gain, reading in readings:
-        if concerned and (now[concerned] > UNLIKE).all() and (_imbalance(model, *reading) < now / gain)[concerned].all():
-            return message
-    return None
+            yield Reading(f"columns '{controls[j]}' and '{controls[i]}' seem to be exchanged",
+                          sorted({*_driven(model, i), *_driven(model, j)}), SWAP_GAIN, (*states[:3], states[3][:, order]))
+    for j in range(model.njnt):
+        if j not in single:
+            first = q[j] + (3 if j in free else 0)
+            other = recording.qpos.copy()
+            other[:, first:first + 4] = np.roll(other[:, first:first + 4], 1, axis=1)
+            turned = leftover.smooth(model, replace(recording, qpos=other), CENTRES, half)[1:]
+            yield Reading(f"column 'qpos:{names[j]}:{first - q[j]}' and the next three seem to be x y z w; order is w x y z",
+                          list(range(v[j], v[j] + (6 if j in free else 3))), SWAP_GAIN, turned)
 
 
-def _scaled(states, scale, second):
-    """The states with positions times `scale` (nv,), and times that count `second` seconds each."""
-    qpos, qvel, qacc, ctrl = states
-    return qpos * scale, qvel * scale / second, qacc * scale / second**2, ctrl
+def _driven(model, actuator):
+    """Dofs of the joint that an actuator drives; none where it drives something else."""
+    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
+        return []
+    return [model.jnt_dofadr[model.actuator_trnid[actuator, 0]]]
+
+
+def _scaled(model, states, factors):
+    """The states with the positions of joints times {joint: factor}; of a free joint, those of its origin."""
+    qpos, qvel, qacc, ctrl = (x.copy() for x in states)
+    for j, factor in factors.items():
+        for x, first in (qpos, model.jnt_qposadr[j]), (qvel, model.jnt_dofadr[j]), (qacc, model.jnt_dofadr[j]):
+            x[:, first:first + (3 if model.jnt_type[j] == FREE else 1)] *= factor
+    return qpos, qvel, qacc, ctrl
 
 
 def _imbalance(model, qpos, qvel, qacc, ctrl):

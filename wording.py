@@ -149,7 +149,9 @@ def terminal(summary, out):
     lines.append(sentence(error_words(summary)))
     left = unexplained_words(summary)
     lines += [sentence(left)] if left else []
-    lines += [f"Note: {warning}" for warning in summary.get("warnings", [])[:8]]
+    warnings = summary.get("warnings", [])
+    lines += [f"Note: {warning}" for warning in warnings[:8]]
+    lines += [f"({len(warnings) - 8} more notes are in the report)"] if len(warnings) > 8 else []
     lines.append(f"Written: {out}/report.html, diagnosis.json, corrected.xml")
     return "\n".join(lines)
 

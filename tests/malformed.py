@@ -41,7 +41,7 @@ def arm():
     return mujoco.MjModel.from_xml_string(ARM)
 
 
-def run(seconds=4.0, seed=0, noise=2e-4):
+def run(seconds=4.0, seed=0, noise=2e-4, amplitude=1.0):
     """(T, 7) a sound recording of ARM, columns as in HEADER: random smooth torques, sampled every DT."""
     rng = np.random.default_rng(seed)
     model = arm()
@@ -49,7 +49,7 @@ def run(seconds=4.0, seed=0, noise=2e-4):
     rows = int(round(seconds / DT))
     t = DT * np.arange(rows)
     tones = rng.uniform(0.4, 1.6, (2, 3)), rng.uniform(0, 2 * np.pi, (2, 3))
-    ctrl = np.array([[1.2], [0.4]]) * np.sin(2 * np.pi * tones[0][:, :, None] * t + tones[1][:, :, None]).mean(axis=1)
+    ctrl = amplitude * np.array([[1.2], [0.4]]) * np.sin(2 * np.pi * tones[0][:, :, None] * t + tones[1][:, :, None]).mean(axis=1)
     table = np.empty((rows, 7))
     for row in range(rows):
         table[row] = [t[row], *data.qpos, *data.qvel, *ctrl[:, row]]

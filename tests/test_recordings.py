@@ -211,10 +211,84 @@ def test_warnings(model, good):
 
 
 def test_same_warning_for_many_files_is_one_line(model, good):
-    constant = good.copy()
-    constant[:, 6] = 0
-    assert check([recording(constant, f"run{k}.csv") for k in range(5)], model) == [
+    many = []
+    for k in range(5):
+        table = good[k:].copy()
+        table[:, 6] = 0
+        table[20:40 + 10 * k, 1] = np.nan
+        many.append(recording(table, f"run{k}.csv"))
+    assert check(many, model) == [
+        "run0.csv and 4 more: qpos:shoulder has nan in up to 15 % of its rows",
         "run0.csv and 4 more: ctrl:elbow_motor is constant at 0; nothing can be said about what only it would show"]
+
+
+def test_a_recording_is_not_judged_by_its_own_copy(tmp_path, model, good):
+    for name in ("run.csv", "copy.csv"):
+        put(tmp_path, text(good), name)
+    with pytest.raises(RecordingError, match="copy.csv: holds the same rows as run.csv; give it once"):
+        check(load([tmp_path / "run.csv", tmp_path / "copy.csv"], model), model)
+
+
+@pytest.mark.parametrize("above", [b"# ", b"# by hand\n# on a Monday, in rain\n", b"# by hand\n#"])
+def test_comments_above_the_header(tmp_path, model, good, above):
+    got, = load(put(tmp_path, above + text(good)), model)  # numpy.savetxt writes its header behind a "# "
+    np.testing.assert_allclose(got.qpos, good[:, 1:3], rtol=1e-8)
+    lines = (above + text(good)).split(b"\n")
+    row = above.count(b"\n") + 3
+    lines[row - 1] = b"x" + lines[row - 1]
+    with pytest.raises(RecordingError, match=f"row {row}, column 'time'"):
+        load(put(tmp_path, b"\n".join(lines)), model)
+
+
+@pytest.mark.parametrize("data, says", [(b"\x1f\x8b\x08", "gunzip"), (b"\x89HDF\r\n", "HDF5"), (b"\x93NUMPY\x01", "numpy.savez")])
+def test_other_formats_are_named(tmp_path, model, data, says):
+    with pytest.raises(RecordingError, match=says):
+        load(put(tmp_path, data + bytes(100)), model)
+
+
+@pytest.mark.parametrize("spoil, says", [
+    (lambda t: t * [1, 1, -1, 1, 1, 1, 1], "column 'qpos:elbow' seems to have the wrong sign"),
+    (lambda t: t * [1, 1, 1, 1, 1, -1, 1], "column 'ctrl:shoulder_motor' seems to have the wrong sign"),
+    (lambda t: t * [1, 1, -1, 1, 1, 1, -1], "'qpos:shoulder' and 'ctrl:shoulder_motor' do not fit the signs of the others"),
+    (lambda t: t[:, [0, 1, 2, 3, 4, 6, 5]], "'ctrl:shoulder_motor' and 'ctrl:elbow_motor' seem to be exchanged")])
+def test_signs_and_columns_that_the_model_cannot_follow(model, spoil, says):
+    table = spoil(run(amplitude=2.0))
+    table[:, 3:5] = np.nan
+    with pytest.raises(RecordingError, match=says):
+        check([recording(table)], model)
+
+
+def test_a_joint_that_sticks_is_not_in_degrees(model, good):
+    """Friction that the nominal model lacks holds the elbow: no acceleration, though gravity pulls."""
+    stuck = good.copy()
+    stuck[:, 2], stuck[:, 3:5] = 0.8 + 1e-4 * np.random.default_rng(0).normal(size=len(good)), np.nan
+    check([recording(stuck)], model)
+
+
+BODY = """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1"><freejoint name="root"/><geom type="box" size=".1 .2 .03" mass="1"/>
+<site name="a" pos=".1 .1 0"/><site name="b" pos="-.1 0 0"/></body></worldbody><actuator><motor name="a" site="a" gear="0 0 1 0 0 0.1"/>
+<motor name="b" site="b" gear="0 0 1 0 0 -0.1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("spoil, says", [
+    (lambda q, u: (q, u), None), (lambda q, u: (q[:, [0, 1, 2, 4, 5, 6, 3]], u), "x y z w"),
+    (lambda q, u: (q * [1000, 1000, 1000, 1, 1, 1, 1], u), "in mm"), (lambda q, u: (q, u[:, ::-1]), None)])
+def test_a_free_body_in_another_convention(spoil, says):
+    model = mujoco.MjModel.from_xml_string(BODY)
+    data, qpos, ctrl = mujoco.MjData(model), [], []
+    data.qvel[:] = 0.3, 0.1, 4.0, 1.0, -0.6, 0.4
+    for k in range(200):
+        data.ctrl[:] = 3 + np.sin(0.1 * k), 3 + np.cos(0.07 * k)
+        qpos.append(data.qpos.copy())
+        ctrl.append(data.ctrl.copy())
+        mujoco.mj_step(model, data, nstep=5)
+    qpos, ctrl = spoil(np.array(qpos), np.array(ctrl))
+    thrown = Recording("throw.csv", 0.01 * np.arange(200), qpos, np.full((200, 6), np.nan), ctrl)
+    if says is None:
+        check([thrown], model)
+    else:
+        with pytest.raises(RecordingError, match=says):
+            check([thrown], model)
 
 
 @pytest.mark.parametrize("unit", ["mm", "m"])

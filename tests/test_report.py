@@ -270,7 +270,7 @@ def test_leftover_force_is_the_one_that_was_left_out():
             rows.append([data.time, *data.qpos, *data.qvel, *data.ctrl])
         mujoco.mj_step(truth, data)
     rows = np.array(rows)
-    time, qpos, qvel, qacc, ctrl = leftover.smooth(Recording("r", rows[:, 0], rows[:, 1:3], rows[:, 3:5], rows[:, 5:7]), 300)
+    time, qpos, qvel, qacc, ctrl = leftover.smooth(truth, Recording("r", rows[:, 0], rows[:, 1:3], rows[:, 3:5], rows[:, 5:7]), 300)
     np.testing.assert_allclose(qvel, rows[np.searchsorted(rows[:, 0], time - 1e-9), 3:5], atol=0.05)
     missing = leftover.forces(made(0.0), qpos, qvel, qacc, ctrl)
     np.testing.assert_allclose(missing, -0.3 * qvel, atol=0.05)
