@@ -148,10 +148,7 @@ class Value(nn.Module):
 
     def forward(self, obs):
         """Values (N,) of obs (N, nobs), in units of reward."""
-        return self.returns.inverse(self.scaled(obs))[:, 0]
-
-    def scaled(self, obs):
-        return self.net(self.normalizer(obs))
+        return self.returns.inverse(self.net(self.normalizer(obs)))[:, 0]
 
 
 # --- supervised models of the dynamics --------------------------------------------------------------

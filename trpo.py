@@ -161,10 +161,11 @@ def policy_update(policy, obs, action, advantage, config):
 def value_update(value, optimizer, obs, returns, config, generator):
     """Fit V to returns (N,) by minibatch Adam on the squared error, in the value's own scale."""
     value.returns.update(returns[:, None])
-    target = (returns[:, None] - value.returns.mean) / value.returns.std
+    inputs, target = value.normalizer(obs), (returns[:, None] - value.returns.mean) / value.returns.std
     for _ in range(config.value_epochs):
-        for rows in torch.randperm(len(obs), generator=generator).split(config.value_batch):
-            loss = ((value.scaled(obs[rows]) - target[rows]) ** 2).mean()
+        order = torch.randperm(len(obs), generator=generator)
+        for x, y in zip(inputs[order].split(config.value_batch), target[order].split(config.value_batch)):
+            loss = ((value.net(x) - y) ** 2).mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -198,7 +199,7 @@ class TRPO:
 
     def __init__(self, policy, value, config):
         self.policy, self.value, self.config = policy, value, config
-        self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr)
+        self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr, foreach=True)  # all weights in one call
         self.generator = torch.Generator()
 
     def state(self):

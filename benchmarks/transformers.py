@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import torch
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -31,11 +32,11 @@ def measure(seeds):
     rows = []
     for seed in seeds:
         s = train.Settings(env="InvertedPendulum-v4", seed=seed, pretrain_steps=30_000).completed()
-        sim = BatchEnv(s.env, s.num_envs)
+        sim = BatchEnv(s.env, s.num_envs, nthread=1)
         learner = train.new_learner(s)
         learner.learn(sim, s.pretrain_steps, seed, freeze_normalizer=False)
         for world, change in WORLDS.items():
-            real = BatchEnv(s.env, s.num_envs, parse_perturbation(change))
+            real = BatchEnv(s.env, s.num_envs, parse_perturbation(change), nthread=1)
             tau_real = rollouts(learner.policy, real, s.real_trajectories, seed + 1)[1]
             held_out = rollouts(learner.policy, real, s.num_envs, seed + 1000)[1]
             pick = np.linspace(0, len(held_out) - 1, POINTS).astype(int)
@@ -44,8 +45,10 @@ def measure(seeds):
                 grounding.fit(tau_real, learner.policy, seed)
                 grounding.update(learner.policy, s.at_steps, seed)
                 a_hat = transformed(sim, grounding.transformer, held_out[pick])
-                rows += [{"seed": seed, "world": world, "algo": algo, "a": f"{a:.5f}", "a_hat": f"{b:.5f}"} for a, b in zip(held_out.a[pick, 0], a_hat)]
-                print(f"seed {seed}, {world}, {algo}: RMS distance from the identity {np.sqrt(np.mean((a_hat - held_out.a[pick, 0]) ** 2)):.4f}", flush=True)
+                a = held_out.a[pick, 0]
+                rows += [{"seed": seed, "world": world, "algo": algo, "a": f"{x:.5f}", "a_hat": f"{y:.5f}"} for x, y in zip(a, a_hat)]
+                distance = np.sqrt(np.mean((a_hat - a) ** 2))
+                print(f"seed {seed}, {world}, {algo}: RMS distance from the identity {distance:.4f}", flush=True)
     with CSV.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -68,7 +71,8 @@ def draw():
 
     rows = list(csv.DictReader(CSV.open(newline="")))
     figure = Figure(figsize=(9, 6), layout="constrained")
-    for panel, (algo, world) in zip(figure.subplots(2, 3, sharex=True, sharey=True).flat, [(a, w) for a in ("gat", "rgat") for w in WORLDS]):
+    panels = [(algo, world) for algo in ("gat", "rgat") for world in WORLDS]
+    for panel, (algo, world) in zip(figure.subplots(2, 3, sharex=True, sharey=True).flat, panels):
         a, b = np.array([(float(r["a"]), float(r["a_hat"])) for r in rows if (r["algo"], r["world"]) == (algo, world)]).T
         panel.plot([-3, 3], [-3, 3], color="black", lw=1)
         panel.scatter(a, b, s=4, alpha=0.4, color="#1f5fa8", lw=0)
@@ -83,6 +87,7 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--draw", action="store_true", help="only draw results/transformers.csv")
     args = parser.parse_args()
+    torch.set_num_threads(1)
     if not args.draw:
         measure(args.seeds)
     draw()

@@ -5,7 +5,7 @@
 
 Appends a row per finished training to results/trpo.csv and skips what is there, so parts may run side by side and
 be stopped at will. An environment is a gymnasium id, perturbed if a change follows: "Hopper-v4 torso:mass*1.27".
-Each policy is judged by 20 episodes acting by its mean and 20 acting at random as it learnt.
+Each policy is judged by 20 episodes acting by its mean and 20 acting at random as it learnt; seconds are CPU time.
 """
 
 import argparse
@@ -94,9 +94,9 @@ def main(argv=None):
             for seed in args.seeds or range(SEEDS[implementation]):
                 if (implementation, name, seed, steps) in finished(args.results):
                     continue
-                start = time.monotonic()
+                start = time.process_time()
                 policy = IMPLEMENTATIONS[implementation](name, seed, steps, args.num_envs, args.threads)
-                seconds = time.monotonic() - start
+                seconds = time.process_time() - start
                 env = make_env(name, args.episodes, args.threads)
                 judge = lambda deterministic: float(np.mean(rollouts(policy, env, args.episodes, 10_000 + seed, deterministic)[0]))
                 row = dict(zip(COLUMNS, (implementation, name, seed, steps, round(judge(True), 1), round(judge(False), 1), round(seconds, 1))))

@@ -100,7 +100,7 @@ def test_value_speaks_in_units_of_reward():
     value = Value(3)
     value.returns.update(torch.tensor([[100.0], [300.0]]))
     obs = torch.randn(6, 3)
-    torch.testing.assert_close(value(obs), 200 + 100 * value.scaled(obs)[:, 0], rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(value(obs), 200 + 100 * value.net(value.normalizer(obs))[:, 0], rtol=1e-5, atol=1e-3)
 
 
 # --- supervised models --------------------------------------------------------------------------------
