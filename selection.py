@@ -15,6 +15,7 @@ import shooting
 from scan import WORTH, Scan
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
+HOPE = 0.05  # p-value of the linear look, of one candidate, up to which a refit is tried: far away it is only a hint
 
 
 class Search(Scan):
@@ -43,8 +44,8 @@ class Search(Scan):
         Single effects by what they leave at full size, where what is alike in a small step may differ, and no two of
         them alike there too; pairs by the linear estimate, where it promises much more than any single effect.
         """
-        level, worth = ALPHA / self.places, self.worth(fit)
-        hopeful = [t for t in trials if t.start and t.p_value < 10 * level and t.held > 0 and t.gain > 0.3 * worth * chi2][:looks]
+        worth = self.worth(fit)
+        hopeful = [t for t in trials if t.start and t.p_value < HOPE and t.held > 0 and t.gain > 0.3 * worth * chi2][:looks]
         tried = [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful]
         left = [f.chi2.sum() for f in shooting.follow(self.small, tried, fit.subset(self.few), iterations=2)]
         chosen = []

@@ -165,8 +165,8 @@ def follow(problem, hypotheses, warm, iterations):
     """Fits of hypotheses as they stand, whose start states follow from those of warm (a Fit, or one for each)."""
     if not hypotheses:
         return []
-    warm = warm if isinstance(warm, list) else [warm] * len(hypotheses)
-    return _fit_starts(problem, hypotheses, np.concatenate([f.qpos for f in warm]), np.concatenate([f.qvel for f in warm]), iterations)
+    begun = evaluate(problem, hypotheses, warm)
+    return _fit_starts(problem, hypotheses, np.concatenate([f.qpos for f in begun]), np.concatenate([f.qvel for f in begun]), iterations)
 
 
 def _fit_starts(problem, hypotheses, qpos, qvel, iterations):
@@ -320,16 +320,20 @@ def _polish(problem, current, which):
 
 
 def evaluate(problem, hypotheses, warm):
-    """Fits at hypotheses as they stand, from the start states of warm (a Fit, or one for each)."""
+    """Fits at hypotheses as they stand: each window from its start state in warm (a Fit, or one for each), or from the
+    recorded one where that does better (a wrong model's impacts can push its start states far off)."""
     warm = warm if isinstance(warm, list) else [warm] * len(hypotheses)
     if not hypotheses:
         return []
-    every = np.arange(len(problem.windows))
-    residual = problem.residuals([s for h in hypotheses for s in [h.settings] * len(every)],
-                                 np.tile(every, len(hypotheses)), np.concatenate([f.qpos for f in warm]),
-                                 np.concatenate([f.qvel for f in warm]))
-    return [Fit(h, f.qpos, f.qvel, r, f.start_jacobian)
-            for h, f, r in zip(hypotheses, warm, np.split(residual, len(hypotheses)))]
+    number, times = len(problem.windows), 2 * len(hypotheses)
+    starts = [np.concatenate([getattr(f, field) for f in warm] + [getattr(problem, f"guess_{field}")] * len(hypotheses))
+              for field in ("qpos", "qvel")]
+    residual = problem.residuals([s for h in hypotheses * 2 for s in [h.settings] * number],
+                                 np.tile(np.arange(number), times), *starts)
+    cost = (residual**2).sum(1).reshape(2, -1)
+    pick = np.argmin(cost, 0) * cost.shape[1] + np.arange(cost.shape[1])
+    parts = (np.split(x[pick], len(hypotheses)) for x in (*starts, residual))
+    return [Fit(h, q, v, r, f.start_jacobian) for h, f, q, v, r in zip(hypotheses, warm, *parts)]
 
 
 def _propose(fit, slope, moves, damping):
