@@ -1,9 +1,9 @@
-"""Effects in a hinge or slide joint. Their scales follow the joint's own inertia."""
+"""Effects in a joint: a hinge or slide, some in a ball joint too. Their scales follow the joint's own inertia."""
 
 import mujoco
 import numpy as np
 
-from effects import (HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Candidate, Effect, Parameter, Place, angle, catalogue,
+from effects import (BALL, HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Candidate, Effect, Parameter, Place, angle, catalogue,
                      constant_force, passive, runge_kutta, turns)
 
 # frictionloss as a nearly rigid constraint: with MuJoCo's default a stuck joint creeps
@@ -13,11 +13,12 @@ DISSIPATION = ('viscous_damping', 'coulomb_friction', 'quadratic_damping', 'back
 
 
 class JointEffect(Effect):
-    """An effect on a hinge or slide."""
+    """An effect on a joint, of the types given."""
     kinds = ('joint',)
+    types = HINGE, SLIDE
 
     def fits(self, model, i):
-        return model.jnt_type[i] in (HINGE, SLIDE)
+        return model.jnt_type[i] in self.types
 
     @staticmethod
     def driven(model, i):
@@ -26,7 +27,7 @@ class JointEffect(Effect):
 
     @staticmethod
     def unit(model, i, hinge, slide):
-        return hinge if turns(model, i) else slide
+        return slide if model.jnt_type[i] == SLIDE else hinge
 
     @staticmethod
     def scale(model, i):
@@ -51,14 +52,19 @@ class JointNumber(JointEffect):
 
     def _field(self, model, i):
         name, column = self.compiled
-        row = i if name.startswith('jnt') else model.jnt_dofadr[i]
-        return getattr(model, name), row if column is None else (row, column)
+        rows = i if name.startswith('jnt') else self._dofs(model, i)
+        return getattr(model, name), rows if column is None else (rows, column)
+
+    @staticmethod
+    def _dofs(model, i):
+        first = model.jnt_dofadr[i]
+        return slice(first, first + (3 if model.jnt_type[i] == BALL else 1))
 
     def parameters(self, model, i):
         (name, *units), (field, k), M = self.number, self._field(model, i), self.scale(model, i)
-        low = -HUGE * M if self.signed else 0.0
-        step = max(self.step * M, 0.01 * abs(field[k]))
-        return Parameter(name, self.unit(model, i, *units), field[k], low, HUGE * M, step),
+        low, nominal = -HUGE * M if self.signed else 0.0, np.ravel(field[k])[0]
+        step = max(self.step * M, 0.01 * abs(nominal))
+        return Parameter(name, self.unit(model, i, *units), nominal, low, HUGE * M, step),
 
     def edit(self, model, i, values):
         field, k = self._field(model, i)
@@ -76,14 +82,14 @@ class JointNumber(JointEffect):
 @catalogue
 class Armature(JointNumber):
     """Inertia of rotor and gears, in the joint's own coordinate."""
-    name, constants, related = 'armature', True, ('mass', 'gain')
+    name, types, constants, related = 'armature', (HINGE, SLIDE, BALL), True, ('mass', 'gain')
     number, compiled, authored, step = ('armature', 'kg·m²', 'kg'), ('dof_armature', None), ('armature', None), 0.01
 
 
 @catalogue
 class ViscousDamping(JointNumber):
     """Force −d·v."""
-    name, simplicity, related = 'viscous_damping', 0, DISSIPATION
+    name, types, simplicity, related = 'viscous_damping', (HINGE, SLIDE, BALL), 0, DISSIPATION
     number, compiled, authored = ('damping', 'N·m·s/rad', 'N·s/m'), ('dof_damping', None), ('damping', 0)
 
 
@@ -97,14 +103,14 @@ class QuadraticDamping(JointNumber):
 @catalogue
 class CoulombFriction(JointNumber):
     """Dry friction, which holds the joint below its limit."""
-    name, simplicity, related = 'coulomb_friction', 0, DISSIPATION
+    name, types, simplicity, related = 'coulomb_friction', (HINGE, SLIDE, BALL), 0, DISSIPATION
     number, compiled, authored = ('frictionloss', 'N·m', 'N'), ('dof_frictionloss', None), ('frictionloss', None)
     step = 0.05
 
     def edit(self, model, i, values):
-        d = model.jnt_dofadr[i]
-        if not model.dof_frictionloss[d]:  # else the nominal model's own softness counts
-            model.dof_solref[d], model.dof_solimp[d] = SOLREF_FRICTION, SOLIMP_FRICTION
+        dofs = self._dofs(model, i)
+        if not model.dof_frictionloss[dofs].any():  # else the nominal model's own softness counts
+            model.dof_solref[dofs], model.dof_solimp[dofs] = SOLREF_FRICTION, SOLIMP_FRICTION
         super().edit(model, i, values)
 
     def write(self, spec, model, i, values):

@@ -9,11 +9,12 @@ import numpy as np
 
 from actuators import nominal_delay
 from effects import runge_kutta
-from signals import Signal
+from signals import SLACK, Signal
 from surroundings import touchable
 
 COPY_BYTES = 50e6  # of edited models, and of sampled controls, kept for the next call
 ROTATES = 1        # body_simple of a simple body with rotations; one that only slides is 2
+MUSCLE = int(mujoco.mjtDyn.mjDYN_MUSCLE)
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
@@ -60,6 +61,7 @@ class Working:
             self.q += range(m.jnt_qposadr[k], m.jnt_qposadr[k] + {FREE: 7, BALL: 4}.get(kind, 1))
             self.v += range(m.jnt_dofadr[k], m.jnt_dofadr[k] + {FREE: 6, BALL: 3}.get(kind, 1))
         self.data = mujoco.MjData(m)
+        self.muscles = {}
         self.copies, self.most_copies = OrderedDict(), max(64, int(COPY_BYTES / mujoco.mj_sizeModel(m)))
         self.controls, self.control_bytes = OrderedDict(), 0
 
@@ -147,4 +149,20 @@ class Working:
             elif i >= 0 and kind == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # from zero at the first row
                 limits = m.actuator_actrange[a] if m.actuator_actlimited[a] else (-np.inf, np.inf)
                 act[i] = np.clip(signal.integral(np.maximum(t, signal.time[0]))[0], *limits)
+            elif i >= 0 and kind == MUSCLE:
+                act[i] = np.interp(t, *self._muscle(recording, a))[0]
         return act
+
+    def _muscle(self, recording, a):
+        """Time and activation (n,) of muscle a over a recording, without delay, from its first control held for long."""
+        time, _, act = self.muscles.get((id(recording), a), (None,) * 3)
+        if act is None:
+            h, m = self.nominal.opt.timestep, self.nominal
+            time = np.arange(recording.time[0], recording.time[-1] + h, h)
+            ctrl = np.clip(recording.ctrl[:, m.actuator_ctrladr[a]], 0.0, 1.0)
+            ctrl = ctrl[np.searchsorted(recording.time, time + SLACK * h, side='right') - 1]
+            act = np.full(len(time), ctrl[0])
+            for k in range(len(time) - 1):
+                act[k + 1] = act[k] + h * mujoco.mju_muscleDynamics(ctrl[k], act[k], m.actuator_dynprm[a, :3])
+            self.muscles[id(recording), a] = time, recording, act  # the recording too, so that its id stays its own
+        return time, act

@@ -69,6 +69,46 @@ def test_filtered_and_integrating_actuators_go_on_too():
         np.testing.assert_allclose(row, q[w.first:w.last + 1], atol=2e-3)  # MuJoCo's `filter` is an Euler step, not exact
 
 
+def test_muscles_go_on_too():
+    world = World(mujoco.MjSpec.from_string("""<mujoco><option timestep="0.002"/><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
+        <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02"/></body></worldbody><actuator><muscle name="m" joint="j" force="50"
+        lengthrange="-1 1" ctrlrange="0 1"/></actuator></mujoco>"""))
+    recording = SimpleNamespace(name='', time=0.01 * np.arange(40), ctrl=np.repeat([[0.1], [1.4], [0.0], [0.6]], 10, axis=0))
+    data, states = mujoco.MjData(world.model), []
+    data.act[0] = recording.ctrl[0, 0]
+    for control in recording.ctrl:
+        states.append((data.qpos.copy(), data.qvel.copy()))
+        data.ctrl[:] = control
+        mujoco.mj_step(world.model, data, nstep=5)
+    q, v = map(np.array, zip(*states))
+    later = world.simulate([{}], q[12:13], v[12:13], [Window(recording, 12, 39)])[0]
+    np.testing.assert_allclose(later[0], q[12:], rtol=0, atol=1e-9)
+
+
+BALLS = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint name="neck" type="ball" {}/>
+<geom type="capsule" fromto="0 0 0 .1 0 -.4" size=".02" mass="1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize('effect, value, attribute', [
+    ('viscous_damping', 0.05, 'damping'), ('armature', 0.02, 'armature'), ('coulomb_friction', 0.1, 'frictionloss')])
+def test_effects_of_a_ball_joint(effect, value, attribute):
+    """The same as the attribute in the file, and as the corrected file; the same in all directions."""
+    world = World(mujoco.MjSpec.from_string(BALLS.format('')))
+    recording = SimpleNamespace(name='', time=0.01 * np.arange(40), ctrl=np.zeros((40, 0)))
+    start = np.array([[0.9, 0.3, -0.3, np.sqrt(1 - 0.81 - 0.18)]]), np.array([[1.0, -2.0, 3.0]])
+    setting = {world.candidate(effect, 'neck'): (value,)}
+    predicted = world.simulate([setting], *start, [Window(recording, 0, 39)])[0][0]
+    stiff = 'solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"'
+    for xml in (BALLS.format(f'{attribute}="{value}" {stiff}'), world.corrected_xml(setting)[0]):
+        model = mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = start[0][0], start[1][0]
+        mujoco.mj_step(model, data, nstep=39 * 5)
+        np.testing.assert_allclose(data.qpos, predicted[-1], rtol=0, atol=1e-6)
+    nominal = world.simulate([{}], *start, [Window(recording, 0, 39)])[0][0]
+    assert abs(nominal[-1] - predicted[-1]).max() > 0.01
+
+
 def test_rows_between_time_steps():
     """Irregular rows that no time step meets, against the closed form of an oscillator pushed at those rows."""
     xml = """<mujoco><option timestep="0.003" gravity="0 0 0" integrator="RK4"/><worldbody><body><joint name="x" type="slide" axis="1 0 0" stiffness="50"/>
