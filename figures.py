@@ -154,7 +154,7 @@ def whisker(parameter, width=220, height=34):
 
     parts = [f'<svg viewBox="0 0 {width} {height}" class="whisker" role="img" aria-label="nominal {wording.number(nominal)}, '
              f'estimate {wording.number(value)}"><path class="grid" d="M6 12H{width - 6}"/>']
-    if nominal is not None:
+    if nominal in marks:
         x = min(max(px(nominal), 24), width - 24)
         parts.append(f'<path class="nominal tickmark" d="M{px(nominal):.1f} 5V19"/>'
                      f'<text class="tick" x="{x:.1f}" y="31" text-anchor="middle">{wording.number(nominal)}</text>')

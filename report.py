@@ -125,7 +125,7 @@ def _head(summary, title):
     before, after, floor, unit, place = wording.errors(summary)
     steps = "".join(f'<div class="{look}"><b>{E(value)} <small>{E(unit)}</small></b><span>{words}</span></div>'
                     for value, look, words in ((before, "nominal", "nominal model"), (after, "corrected", "corrected model"),
-                                               (floor, "noise", "noise alone")))
+                                               (floor, "noise", "perfect simulator")))
     left = wording.unexplained_words(summary)
     sentences = " ".join(map(wording.sentence, [wording.error_words(summary), *([left] if left else [])]))
     horizon = summary["fit"]["held_out"].get("horizon_s", 0.3)
@@ -221,7 +221,7 @@ def _prediction(diagnosis):
         x, before, after, floor = (np.array([np.nan if point.get(key) is None else point[key] for point in curve], dtype=float)
                                    for key in ("seconds", "before", "after", "floor"))
         wide = np.nanmax(before) > 8 * max(np.nanmin(after), 1e-12)
-        noise = [("noise", "noise alone")] if np.isfinite(floor).any() else []
+        noise = [("noise", "perfect simulator")] if np.isfinite(floor).any() else []
         lines = [Series(x, before, "nominal"), Series(x, after, "corrected"), Series(x, floor, "noise")]
         picture = (_legend(("nominal", "nominal"), ("corrected", "corrected"), *noise)
                    + _box(chart(lines, "horizon (s)", "error (× noise)", log_y=bool(wide), zero=not wide,
@@ -231,8 +231,9 @@ def _prediction(diagnosis):
         unit, factor = wording.SMALL.get(channel["unit"], (channel["unit"], 1))
         values = (None if channel[key] is None else channel[key] * factor for key in ("before", "after", "floor"))
         rows.append([E(name), *(wording.number(value, 2) for value in values), E(unit)])
-    table = _table(["channel", "nominal", "corrected", "noise alone", ""], rows)
-    return _section("How well it predicts recordings it was not fitted to", _pair(picture, table))
+    table = _table(["channel", "nominal", "corrected", "perfect", ""], rows)
+    return _section("How well it predicts recordings it was not fitted to", _pair(picture, table),
+                    note="A perfect simulator, too, would start from measured positions and velocities: their noise sets the limit.")
 
 
 def _traces(diagnosis):

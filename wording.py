@@ -4,8 +4,11 @@ Everything here reads `Diagnosis.summary`, the dictionary that becomes diagnosis
 """
 import math
 
+import numpy as np
+
 SPOKEN = {"coulomb": "Coulomb", "stribeck": "Stribeck", "back_emf": "back-EMF", "center_of_mass": "centre of mass"}
 ALWAYS_THERE = {"center_of_mass", "gravity", "ground_height", "link_length"}  # a nominal 0 of theirs is a value like any other
+MUCH = 0.5  # of the squared error above the noise: no match, though nothing is named
 SMALL = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}  # errors and noise are small: in these they read better
 
 
@@ -23,8 +26,10 @@ def place_words(place):
 
 def number(value, digits=3):
     """A number to so many significant digits, without a needless exponent: 0.0005, 411, 1.2e-07."""
-    if value is None or not math.isfinite(value):
+    if value is None or math.isnan(value):
         return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
     if value == 0:
         return "0"
     if not 1e-4 <= abs(value) < 1e6:
@@ -41,7 +46,7 @@ def estimate(parameter):
         return number(value) + unit
     half = (high - low) / 2
     decimals = max(0, (half < 2.95 * 10.0 ** math.floor(math.log10(half))) - math.floor(math.log10(half)))  # 0.12 but 0.4
-    if decimals > 9 or half > 1e6:
+    if decimals > 6 or half > 1e6:
         return f"{number(value)} ({number(low)} to {number(high)}){unit}"
     most = max(0, 3 - math.floor(math.log10(abs(value)))) if value else decimals
     if decimals > most:  # four digits of a value are enough, however narrow its interval
@@ -58,10 +63,11 @@ def finding_words(finding):
         on = depends_words(finding.get("depends_on"))
         return (f"{place}: a force that the catalogue has no name for{f', depending on {on}' if on else ''}"
                 + when_words(finding.get("when")))
-    parameters = finding["parameters"]
+    parameters = [p for p in finding["parameters"] if math.isfinite(p["value"])]  # a stop may be on one side only
+    parameters = [p for p in parameters if p["value"] != p["nominal"]] or parameters
     if not parameters:
         return f"{place}: {effect}"
-    if parameters[0]["nominal"] in (0, None) and finding["effect"] not in ALWAYS_THERE:
+    if parameters[0]["nominal"] in (0, None, math.inf, -math.inf) and finding["effect"] not in ALWAYS_THERE:
         values = ", ".join((f"{p['name']} " if len(parameters) > 1 else "") + estimate(p) for p in parameters)
         sentence = f"{place}: {effect} {values} was left out"
     else:
@@ -73,7 +79,7 @@ def finding_words(finding):
 def change(parameter):
     """"4.52 ± 0.03 kg instead of 3.56 (+27 %)"."""
     nominal = parameter["nominal"]
-    if nominal is None:
+    if nominal is None or math.isinf(nominal):
         return estimate(parameter)
     share = f" ({100 * (parameter['value'] / nominal - 1):+.0f} %)" if nominal else ""
     return f"{estimate(parameter)} instead of {number(nominal)}{share}"
@@ -100,21 +106,29 @@ def depends_words(depends_on):
 def errors(summary):
     """Held-out error as words (before, after, floor, unit, place): in SI at the channel in which the two models differ
     most (counted in noise), or over all channels in multiples of the noise."""
-    fit = summary["fit"]["held_out"]
+    fit, place, factor = summary["fit"]["held_out"], "", 1
+    unit = "times the noise"
     channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"]}
-    if not channels:
-        return *(number(fit[key], 2) for key in ("before", "after", "floor")), "times the noise", ""
-    name = max(channels, key=lambda n: abs(channels[n]["before"] - channels[n]["after"]) / channels[n]["floor"])
-    unit, factor = SMALL.get(channels[name]["unit"], (channels[name]["unit"], 1))
-    return *(number(channels[name][key] * factor, 2) for key in ("before", "after", "floor")), unit, " at " + name.split(":", 1)[1]
+    if channels:
+        name = max(channels, key=lambda n: np.nan_to_num(abs(channels[n]["before"] - channels[n]["after"]) / channels[n]["floor"]))
+        fit, place = channels[name], " at " + _channel(name)
+        unit, factor = SMALL.get(fit["unit"], (fit["unit"], 1))
+    return *(number(fit[key] * factor, 2) for key in ("before", "after", "floor")), unit, place
+
+
+def _channel(name):
+    """"qpos:elbow" -> "elbow", "qpos:root:rot" -> "root (rotation)"; a joint without a name goes by its index."""
+    joint, _, part = name.split(":", 1)[1].partition(":")
+    part = {"pos": " (position)", "rot": " (rotation)"}.get(part, f":{part}" if part else "")
+    return ("joint " if joint.isdigit() else "") + joint + part
 
 
 def error_words(summary):
-    """"held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; the sensors' noise alone makes 1 mrad"."""
+    """"held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; a perfect simulator's would be 1, from noise in ..."."""
     before, after, floor, unit, place = errors(summary)
     ahead = f"held-out error {summary['fit']['held_out'].get('horizon_s', 0.3):g} s ahead"
     change = f"is {before} {unit}" if summary["verdict"] == "match" else f"falls from {before} to {after} {unit}"
-    return f"{ahead} {change}{place}; the sensors' noise alone makes {floor} {unit}"
+    return f"{ahead} {change}{place}; a perfect simulator would show {floor}, for it too starts from noisy measurements"
 
 
 def unexplained_words(summary):
@@ -133,6 +147,8 @@ def unexplained_words(summary):
 def verdict_words(summary):
     """The first line of everything."""
     if summary["verdict"] == "match":
+        if ((summary.get("unexplained") or {}).get("fraction") or 0) > MUCH:
+            return "Something is missing, but no effect of the catalogue improves the prediction of recordings held out."
         return "Nothing is missing: no effect of the catalogue improves the prediction of recordings held out."
     count = len(summary["findings"])
     return "One thing is wrong with the simulator." if count == 1 else f"{count} things are wrong with the simulator."

@@ -185,9 +185,24 @@ def test_error_in_words():
            "channels": {"qpos:a": {"before": 0.002, "after": 0.002, "floor": 0.001, "unit": "rad"},
                         "qpos:elbow": {"before": 0.031, "after": 0.002, "floor": 0.001, "unit": "rad"}}}
     summary = {"verdict": "mismatch", "fit": {"held_out": fit}}
-    assert wording.error_words(summary) == "held-out error 0.3 s ahead falls from 31 to 2.0 mrad at elbow; the sensors' noise alone makes 1.0 mrad"
+    assert wording.error_words(summary) == ("held-out error 0.3 s ahead falls from 31 to 2.0 mrad at elbow; "
+                                            "a perfect simulator would show 1.0, for it too starts from noisy measurements")
+    fit["channels"] = {"qpos:1:rot": {**fit["channels"]["qpos:elbow"], "before": float("inf")}}
+    assert "falls from ∞ to 2.0 mrad at joint 1 (rotation);" in wording.error_words(summary)
     del fit["channels"]
     assert "falls from 31 to 2.0 times the noise" in wording.error_words(summary)
+
+
+def test_a_stop_on_one_side():
+    never, stop = parameter("low", -np.inf, -np.inf, 0.0, "rad"), parameter("high", np.inf, 0.5, 0.01, "rad")
+    assert wording.finding_words(finding("joint_stop", "joint", "elbow", never, stop)) == "joint elbow: joint stop 0.500 ± 0.010 rad was left out"
+
+
+def test_a_match_far_above_the_noise_says_so():
+    summary = {"verdict": "match", "findings": [], "unexplained": {"fraction": 0.05}}
+    assert wording.verdict_words(summary).startswith("Nothing is missing")
+    summary["unexplained"]["fraction"] = 0.8
+    assert wording.verdict_words(summary).startswith("Something is missing, but no effect of the catalogue")
 
 
 @pytest.mark.parametrize("value, words", [(0.0005, "0.000500"), (411, "411"), (1.23e-7, "1.23e-7"), (0, "0"), (float("nan"), "–"), (2.5e9, "2.50e9")])
