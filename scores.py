@@ -82,10 +82,10 @@ def summed(labels, x):
 
 
 def solve_small(gram, score):
-    """gram^-1 score for a small, possibly singular and badly scaled Gram matrix."""
-    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    block = gram / size / size[:, None]
-    return np.linalg.solve(block + 1e-8 * np.eye(len(size)), score / size) / size
+    """gram^-1 score for small, possibly singular and badly scaled Gram matrices: (..., k, k), (..., k) -> (..., k)."""
+    size = np.sqrt(np.maximum(np.einsum("...kk->...k", gram), 1e-300))
+    block = gram / size[..., None, :] / size[..., None] + 1e-8 * np.eye(size.shape[-1])
+    return np.linalg.solve(block, (score / size)[..., None])[..., 0] / size
 
 
 def sandwich(gram, score, value):
@@ -98,7 +98,7 @@ def sandwich(gram, score, value):
     bread = np.linalg.inv(total / size / size[:, None] + 1e-10 * np.eye(len(size))) / size / size[:, None]
     rest = score - gram @ value
     # leave-one-out change of the estimate: (total - gram_c)^-1 rest_c
-    moves = np.array([solve_small(total - g + 1e-6 * total, r) for g, r in zip(gram, rest)])
+    moves = solve_small(total - gram + 1e-6 * total, rest)
     count = len(gram)
     return (count - 1) / count * moves.T @ moves + 1e-300 * bread
 
@@ -114,8 +114,6 @@ def wald(gram, score):
     size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     whitened = np.linalg.solve(covariance / size / size[:, None] + 1e-6 * np.eye(k), value / size)
     statistic = float(value / size @ whitened) / k * (count - k) / (count - 1)
-    held = np.empty(count)  # gain in the cluster that the estimate has not seen
-    for c in range(count):
-        v = solve_small(gram.sum(0) - gram[c], score.sum(0) - score[c])
-        held[c] = 2 * score[c] @ v - v @ gram[c] @ v
+    unseen = solve_small(gram.sum(0) - gram, score.sum(0) - score)  # what the other clusters say
+    held = 2 * (score * unseen).sum(1) - np.einsum("ck,ckl,cl->c", unseen, gram, unseen)
     return value, gain, f_survival(statistic, k, count - k), held

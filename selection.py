@@ -47,7 +47,8 @@ class Search(Scan):
         worth = self.worth(fit)
         hopeful = [t for t in trials if t.start and t.p_value < HOPE and t.held > 0 and t.gain > 0.3 * worth * chi2][:looks]
         tried = [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful]
-        left = [f.chi2.sum() for f in shooting.follow(self.small, tried, fit.subset(self.few), iterations=2)]
+        begun = shooting.evaluate(self.small, tried, fit.subset(self.few))
+        left = [f.chi2.sum() for f in shooting.follow(self.small, begun, iterations=2)]
         chosen = []
         for i in sorted(range(len(left)), key=left.__getitem__):
             rivals = [j for j in chosen if self.alike(hopeful[i], hopeful[j], gram) and left[i] > 0.9 * left[j]]
@@ -121,7 +122,7 @@ class Search(Scan):
         possible = {}
         for candidate in fit.hypothesis.candidates:
             small = fit.subset(self.few)
-            others, pair = self.alternatives(small, candidate)
+            others, pair = self.alternatives(fit, small, candidate)
             if pair is not None:
                 [new] = shooting.solve(self.problem, [pair], fit, iterations=5)
                 added = [c for c in pair.candidates if c not in fit.hypothesis.candidates]
@@ -160,8 +161,10 @@ class Search(Scan):
         owner = np.arange(rows) * self.pieces // rows
         return np.stack([square[:, owner == i].sum(1) for i in range(self.pieces)], 1).ravel()
 
-    def alternatives(self, small, candidate, most=6):
+    def alternatives(self, fit, small, candidate, most=6):
         """What can stand in a candidate's place, on few windows: [(Fit, other candidate)], and a promising pair or None.
+
+        small: the fit's part on few windows.
 
         To first order: the residual that the effect's absence would leave, explained by the columns of others.
         """
@@ -169,14 +172,21 @@ class Search(Scan):
         without = small.hypothesis.minus(candidate)
         own = [{**s, candidate: values} for s in shooting.perturbed(without)[0]]
         options = [o for o in self.options if o.candidate not in small.hypothesis.candidates and (o.linear or o in self.kept)]
-        tried = [small.hypothesis.plus(o.candidate, d).settings for o in options for d in o.directions]
         # absence is extrapolated from a tenth less, unless the effect is a limit: unstable motion is soon not linear
         nominal, less = np.array(candidate.nominal), without.settings
         tenth = np.isfinite(nominal).all()
         if tenth:
             less = without.plus(candidate, nominal + 0.9 * (np.array(values) - nominal)).settings
+        at_hand = {o: self.looked[o][1][self.few] for o in options if o in self.looked and self.looked[o][0] is fit}
+        tried = [small.hypothesis.plus(o.candidate, d).settings for o in options if o not in at_hand for d in o.directions]
         slope = shooting.columns(self.small, [small], [own + [less] + tried])[0]
         slope[..., len(own)] *= 10.0 if tenth else 1.0
+        at = len(own) + 1
+        for o in options:
+            if o not in at_hand:
+                at_hand[o] = slope[..., at:at + len(o.directions)]
+                at += len(o.directions)
+        slope = np.concatenate([slope[..., :len(own) + 1], *(at_hand[o] for o in options)], -1)
         scan = shooting.project(self.small, small, slope)
         gram, k = scan.gram.sum(0), len(own)
         score = scan.score.sum(0) - gram[:, k]  # of the residual without the effect

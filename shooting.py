@@ -157,29 +157,31 @@ def _eliminate(jacobian, damping):
 
 def fit_starts(problem, hypothesis, qpos=None, qvel=None, iterations=8):
     """Start states of all windows under one hypothesis, by Levenberg-Marquardt, damped window by window."""
-    qpos, qvel = problem.guess_qpos if qpos is None else qpos, problem.guess_qvel if qvel is None else qvel
-    return _fit_starts(problem, [hypothesis], qpos, qvel, iterations)[0]
+    every, settings = np.arange(len(problem.windows)), [hypothesis.settings] * len(problem.windows)
+    qpos = problem.guess_qpos if qpos is None else qpos
+    qvel = problem.guess_qvel if qvel is None else qvel
+    residual = problem.residuals(settings, every, qpos, qvel)
+    begun = Fit(hypothesis, qpos, qvel, residual, problem.start_jacobians(settings, every, qpos, qvel, residual))
+    return _fit_starts(problem, [begun], iterations, renew=True)[0]
 
 
-def follow(problem, hypotheses, warm, iterations):
-    """Fits of hypotheses as they stand, whose start states follow from those of warm (a Fit, or one for each)."""
-    if not hypotheses:
-        return []
-    begun = evaluate(problem, hypotheses, warm)
-    return _fit_starts(problem, hypotheses, np.concatenate([f.qpos for f in begun]), np.concatenate([f.qvel for f in begun]), iterations)
+def follow(problem, begun, iterations):
+    """Fits whose parameters stand as begun (a list of Fit), with start states adapted to them.
+
+    Their start Jacobians, of another hypothesis perhaps, serve in every window until a step fails there.
+    """
+    return _fit_starts(problem, begun, iterations, renew=False) if begun else []
 
 
-def _fit_starts(problem, hypotheses, qpos, qvel, iterations):
-    """Fits of several hypotheses, their parameters as they stand; start states (H * W, ...) to begin from."""
-    number = len(problem.windows)
-    which = np.tile(np.arange(number), len(hypotheses))
-    settings = [s for h in hypotheses for s in [h.settings] * number]
+def _fit_starts(problem, begun, iterations, renew):
+    """The start states of several Fits at once; renew: a new Jacobian after every step that gained, not only where one failed."""
+    number, every = len(problem.windows), np.arange(len(begun) * len(problem.windows))
+    which = every % number
+    settings = [s for f in begun for s in [f.hypothesis.settings] * number]
     pick = lambda rows: ([settings[i] for i in rows], which[rows])
-    qpos, qvel, every = qpos.copy(), qvel.copy(), np.arange(len(which))
-    residual = problem.residuals(settings, which, qpos, qvel)
-    jacobian = problem.start_jacobians(settings, which, qpos, qvel, residual)
+    qpos, qvel, residual, jacobian = (np.concatenate([getattr(f, x) for f in begun]) for x in ("qpos", "qvel", "residual", "start_jacobian"))
     damping, active = np.full(len(every), 1e-3), every
-    for _ in range(iterations):
+    for i in range(iterations):
         inverse = _eliminate(jacobian[active], damping[active])
         step = np.einsum("wij,wmj,wm->wi", inverse, jacobian[active], residual[active])
         new_qpos, new_qvel = problem.moved(qpos[active], qvel[active], step)
@@ -189,14 +191,15 @@ def _fit_starts(problem, hypotheses, qpos, qvel, iterations):
         gained = better & (old_cost - new_cost > 1e-3 * old_cost)
         good = active[better]
         qpos[good], qvel[good], residual[good] = new_qpos[better], new_qvel[better], new[better]
-        damping[active] = np.where(better, damping[active] / 10, damping[active] * 10)
-        again = active[gained]
-        if len(again):
+        damping[active] = np.where(better, damping[active] / 10, damping[active] * (10 if renew else 1))
+        again = active[gained] if renew else active[~better]
+        if len(again) and (renew or i < iterations - 1):
             jacobian[again] = problem.start_jacobians(*pick(again), qpos[again], qvel[again], residual[again])
         active = active[gained | (~better & (damping[active] < 1e3))]
         if not len(active):
             break
-    return [Fit(h, *(x[i * number:(i + 1) * number] for x in (qpos, qvel, residual, jacobian))) for i, h in enumerate(hypotheses)]
+    parts = (np.split(x, len(begun)) for x in (qpos, qvel, residual, jacobian))
+    return [Fit(f.hypothesis, *x) for f, *x in zip(begun, *parts)]
 
 
 # ---- hypotheses with parameters ----------------------------------------------------------------
@@ -250,7 +253,7 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
     current = evaluate(problem, hypotheses, warm)
     # a hypothesis so far away that it fits worse at first: its start states have to follow before its slopes mean anything
     far = [h for h in range(len(hypotheses)) if current[h].chi2.sum() > 1.01 * warm[h].chi2.sum()]
-    for h, fit in zip(far, follow(problem, [hypotheses[h] for h in far], [warm[h] for h in far], iterations=3)):
+    for h, fit in zip(far, follow(problem, [current[h] for h in far], iterations=3)):
         current[h] = fit
     damping = np.full(len(hypotheses), 1e-3)
     moving = [h for h in range(len(hypotheses))]
