@@ -152,7 +152,7 @@ class Lag(ActuatorEffect):
         return super().fits(model, i) and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
 
     def parameters(self, model, i):
-        return Parameter('seconds', 's', 0.0, 0.0, 5.0, max(0.001, model.opt.timestep))  # less is lost in a step,
+        return Parameter('seconds', 's', 0.0, 0.0, 5.0, max(0.001, model.opt.timestep)),  # less is lost within a step
 
     def command(self, signal, model, i, values):
         return replace(signal, lag=values[0])
