@@ -267,12 +267,16 @@ class JointStop(JointEffect):
 
     def edit(self, model, i, values):
         model.jnt_limited[i] = True
-        model.jnt_range[i] = np.clip(values, -self.NEVER, self.NEVER)
+        model.jnt_range[i] = self._range(values)
+
+    def _range(self, values):
+        low, high = np.clip(values, -self.NEVER, self.NEVER)
+        return low, max(high, low + 1e-6)  # MuJoCo compiles no other
 
     def write(self, spec, model, i, values):
         joint = spec.joint(model.joint(i).name)
         joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-        joint.range = [angle(spec, model, i, x) for x in np.clip(values, -self.NEVER, self.NEVER)]
+        joint.range = [angle(spec, model, i, x) for x in self._range(values)]
         return 'mjcf'
 
 
