@@ -47,8 +47,8 @@ class Search(Scan):
         worth = self.worth(fit)
         hopeful = [t for t in trials if t.start and t.p_value < HOPE and t.held > 0 and t.gain > 0.3 * worth * chi2][:looks]
         tried = [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful]
-        begun = shooting.evaluate(self.small, tried, fit.subset(self.few))
-        left = [f.chi2.sum() for f in shooting.follow(self.small, begun, iterations=2)]
+        begun = shooting.evaluate(self.scouting, tried, fit.subset(self.scouts))
+        left = [f.chi2.sum() for f in shooting.follow(self.scouting, begun, iterations=2)]
         chosen = []
         for i in sorted(range(len(left)), key=left.__getitem__):
             rivals = [j for j in chosen if self.alike(hopeful[i], hopeful[j], gram) and left[i] > 0.9 * left[j]]
