@@ -186,7 +186,7 @@ def mechanism(model, poses, places, labels, width=380, height=300):
     for label, point in zip(labels, points):
         if point is not None:
             parts.append(f'<circle class="badmark" cx="{point[0]:.1f}" cy="{point[1]:.1f}" r="11"/>')
-        x, y = (width / 2, 18) if point is None else point
+        x, y = (0, 34) if point is None else point  # what is wrong everywhere stands in the corner
         right = x < width * 0.5
         ty = float(np.clip(y - 18, 16, height - 10))
         while any(abs(ty - other) < 15 for other in used):

@@ -3,10 +3,11 @@
 STYLE = """
 :root{--ink:#1d2733;--soft:#5b6875;--paper:#fff;--card:#f5f7f9;--rule:#dde3e8;--part:#c3ccd5;--edge:#5b6875;
 --measured:#1d2733;--nominal:#c8500a;--corrected:#0a66b0;--noise:#8a949e;--bad:#d21f3c}
-@media (prefers-color-scheme:dark){:root{--ink:#e7ecf1;--soft:#9aa7b4;--paper:#12171d;--card:#1b222a;--rule:#323c46;--part:#46525e;
---edge:#a9b5c1;--measured:#e7ecf1;--nominal:#f28a45;--corrected:#58b0f5;--noise:#77828d;--bad:#ff5c74}}
+@media (prefers-color-scheme:dark){:root{--ink:#e7ecf1;--soft:#9aa7b4;--paper:#12171d;--card:#1b222a;--rule:#323c46;
+--part:#46525e;--edge:#a9b5c1;--measured:#e7ecf1;--nominal:#f28a45;--corrected:#58b0f5;--noise:#77828d;--bad:#ff5c74}}
 *{box-sizing:border-box}
-body{margin:0;background:var(--paper);color:var(--ink);font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;
+body{margin:0;background:var(--paper);color:var(--ink);
+font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;
 -webkit-text-size-adjust:100%;overflow-wrap:anywhere}
 main{max-width:1040px;margin:0 auto;padding:20px 16px 60px}
 h1{font-size:1.7rem;line-height:1.2;margin:.2em 0 .5em;letter-spacing:-.01em}
@@ -22,7 +23,7 @@ h3 small{font-weight:400;color:var(--soft)}
 .steps{display:flex;flex-wrap:wrap;gap:10px;margin:1em 0 .2em}
 .steps div{flex:1 1 90px;background:var(--card);border-radius:10px;padding:10px 14px;border-left:5px solid var(--noise)}
 .steps .nominal{border-color:var(--nominal)}.steps .corrected{border-color:var(--corrected)}
-.steps small{font-size:.9rem;font-weight:400}
+.steps small{font-size:.85rem;font-weight:400;white-space:nowrap}
 .steps b{display:block;font-size:1.5rem;line-height:1.2}
 .steps span{color:var(--soft);font-size:.82rem}
 .pair{display:grid;grid-template-columns:minmax(0,1fr);gap:16px}
@@ -53,6 +54,7 @@ svg text{font-family:inherit;fill:var(--ink)}
 table{border-collapse:collapse;width:100%;font-size:.9rem}
 th,td{text-align:left;padding:5px 12px 5px 0;border-bottom:1px solid var(--rule);vertical-align:middle;white-space:nowrap}
 th{color:var(--soft);font-weight:500}
+td small{display:block;color:var(--soft);font-weight:400}
 .chosen td:first-child{font-weight:700;box-shadow:inset 4px 0 var(--bad);padding-left:10px}
 .bar{display:inline-block;width:90px;height:9px;background:var(--rule);border-radius:5px;overflow:hidden;margin-right:6px}
 .bar i{display:block;height:100%;background:var(--corrected)}
@@ -75,6 +77,10 @@ figure{margin:0}
 .controls input{flex:1;min-width:0;accent-color:var(--corrected)}
 .controls button{font:inherit;font-size:.86rem;min-width:70px;padding:4px 10px;border:1px solid var(--rule);border-radius:8px;
 background:var(--card);color:var(--ink)}
+@media (max-width:559px){.estimates tr{display:grid;grid-template-columns:1fr auto;border-bottom:1px solid var(--rule)}
+.estimates :is(th,td){border:0;padding-bottom:2px}.estimates :is(th,td):nth-child(n+3){grid-column:1/-1}
+.estimates td:nth-child(3)::before{content:"nominal "}
+.estimates th:nth-child(n+3){display:none}.steps b{font-size:1.25rem}.steps div{padding:8px 10px}.bar{width:56px}}
 details summary{cursor:pointer;margin:1em 0 .3em}
 """
 
@@ -84,7 +90,10 @@ for (const figure of document.querySelectorAll("figure.animation")) {
   const button = figure.querySelector("button"), slider = figure.querySelector("input");
   const frames = Number(slider.max) + 1, pause = 0.8, seconds = Number(figure.dataset.seconds);
   let playing = !matchMedia("(prefers-reduced-motion: reduce)").matches, from = performance.now();
-  const show = k => { for (const look in paths) figure.querySelector(".layer." + look).setAttribute("d", paths[look][k]); slider.value = k; };
+  const show = k => {
+    for (const look in paths) figure.querySelector(".layer." + look).setAttribute("d", paths[look][k]);
+    slider.value = k;
+  };
   const name = () => { button.textContent = playing ? "pause" : "play"; };
   const step = now => {
     if (!playing) return;

@@ -108,7 +108,7 @@ def _pair(*parts):
     return f'<div class="pair">{inside}</div>' if inside else ""
 
 
-def _table(heads, rows):
+def _table(heads, rows, look=""):
     """heads: texts; rows: lists of cells in HTML, a first cell that starts with "*" marks the row. "" without rows."""
     if not rows:
         return ""
@@ -117,7 +117,7 @@ def _table(heads, rows):
         chosen = ' class="chosen"' if row[0].startswith("*") else ""
         body += f"<tr{chosen}>" + "".join(f"<td>{cell}</td>" for cell in [row[0].lstrip("*"), *row[1:]]) + "</tr>"
     head = "".join(f"<th>{E(text)}</th>" for text in heads)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f'<div class="scroll"><table class="{look}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _head(summary, title):
@@ -158,9 +158,8 @@ def _findings(diagnosis):
     cards = []
     for i, finding in enumerate(diagnosis.summary["findings"]):
         curve = next((c for c in curves if c["finding"] == i), None)
-        table = "" if curve else _table(["parameter", "value, 95 %", "nominal", ""],
-                                        [[E(p["name"]), E(wording.estimate(p)), E(wording.number(p["nominal"])), whisker(p)]
-                                         for p in finding["parameters"]])
+        estimates = [] if curve else [_parameter(p) for p in finding["parameters"]]
+        table = _table(["parameter", "value, 95 %", "nominal", ""], estimates, "estimates")
         plots = [_residual(r) for r in left if r["finding"] == i]
         plots += [_curve(curve, finding["parameters"])] if curve else []
         others = "".join(f"<li>{E(wording.finding_words(other))}</li>" for other in finding.get("also_possible") or [])
@@ -168,6 +167,13 @@ def _findings(diagnosis):
         cards.append(f'<article class="card"><h3>{i + 1}. {E(wording.finding_words(finding))}</h3>'
                      f'<p class="facts">{E("; ".join(_facts(finding)))}</p>{table}{_pair(*plots)}{others}</article>')
     return _section("What is wrong, in order of importance", *cards)
+
+
+def _parameter(p):
+    """The row of a parameter; one that moves nothing in the recordings stays where it was."""
+    seen = p["value"] != p["nominal"]
+    return [E(p["name"]), E(wording.estimate(p)) if seen else "not seen in these recordings", E(wording.number(p["nominal"])),
+            whisker(p) if seen else ""]
 
 
 def _facts(finding):
@@ -211,7 +217,8 @@ def _residual(residual):
                      Series(*binned(x, before), "nominal"), Series(*binned(x, after), "corrected")],
                     wording.axis_words(residual["variable"], residual["x_unit"]), f"force left at {residual['joint']} ({unit})",
                     label="residual against " + residual["variable"])
-    return picture and _legend(("nominal", "left over by the nominal model"), ("corrected", "by the corrected one")) + _box(picture)
+    legend = _legend(("nominal", "left over by the nominal model"), ("corrected", "by the corrected one"))
+    return picture and legend + _box(picture)
 
 
 def _prediction(diagnosis):
@@ -230,10 +237,11 @@ def _prediction(diagnosis):
     for name, channel in (fit.get("channels") or {}).items():
         unit, factor = wording.SMALL.get(channel["unit"], (channel["unit"], 1))
         values = (None if channel[key] is None else channel[key] * factor for key in ("before", "after", "floor"))
-        rows.append([E(name), *(wording.number(value, 2) for value in values), E(unit)])
-    table = _table(["channel", "nominal", "corrected", "perfect", ""], rows)
+        rows.append([E(wording.channel_words(name)), *(wording.number(value, 2) for value in values), E(unit)])
+    table = _table(["", "nominal", "corrected", "perfect", ""], rows)
     return _section("How well it predicts recordings it was not fitted to", _pair(picture, table),
-                    note="A perfect simulator, too, would start from measured positions and velocities: their noise sets the limit.")
+                    note="A perfect simulator, too, would start from measured positions and velocities: their noise sets the "
+                         "limit.")
 
 
 def _traces(diagnosis):
@@ -245,6 +253,8 @@ def _traces(diagnosis):
     shown = sorted(first.values())[:8]
     more = [i for i in range(len(diagnosis.traces)) if i not in shown][:8]
 
+    units = {name: channel["unit"] for name, channel in (diagnosis.summary["fit"]["held_out"].get("channels") or {}).items()}
+
     def draw(i):
         trace = diagnosis.traces[i]
         time = np.asarray(trace["time"], float)
@@ -252,9 +262,10 @@ def _traces(diagnosis):
         joint = np.isnan(list(values.values())).all(axis=0)  # between two predictions; the recording runs on
         lines = [Series(time[~joint], values["measured"][~joint], "measured"),
                  *(Series(time, values[look], look) for look in ("nominal", "corrected"))]
-        name = trace["channel"].split(":", 1)[-1]
-        return (f'<h3 class="trace">{E(trace["channel"])} <small>{E(trace["recording"])}</small></h3>'
-                + _box(chart(lines, "time (s)", name, 900, 240, label=f"{name} over time"), wide=True))
+        name = wording.channel_words(trace["channel"])
+        unit = f" ({units[trace['channel']]})" if trace["channel"] in units else ""
+        return (f'<h3 class="trace">{E(name)} <small>{E(trace["recording"])}</small></h3>'
+                + _box(chart(lines, "time (s)", name + unit, 900, 240, label=f"{name} over time"), wide=True))
 
     legend = _legend(("measured", "recorded"), ("nominal", "nominal"), ("corrected", "corrected"))
     folded = f"<details><summary>{len(more)} more</summary>{''.join(map(draw, more))}</details>" if more else ""
@@ -275,10 +286,11 @@ def _ranking(diagnosis):
         share = 0 if removed is None or not math.isfinite(removed) else min(1, max(0, removed))
         found = (candidate["effect"], place["kind"], place["name"]) in chosen
         bar = f'<span class="bar"><i style="width:{100 * share:.0f}%"></i></span> {100 * share:.0f} %'
-        rows.append(["*" * found + E(wording.effect_words(candidate["effect"])), E(wording.place_words(place)), bar,
-                     E(wording.p_value(candidate["p_value"]))])
-    return _section("Candidates", _table(["effect", "place", "error it removes alone", "p"], rows),
-                    note="Each effect at each place, on its own, against the nominal model. Marked: in the diagnosis.")
+        name = f'{E(wording.effect_words(candidate["effect"]))}<small>{E(wording.place_words(place))}</small>'
+        rows.append(["*" * found + name, bar, E(wording.p_value(candidate["p_value"]))])
+    return _section("Candidates", _table(["effect", "removes alone", "p"], rows),
+                    note="The share of the squared error that each effect at each place removes on its own. Marked: in the "
+                         "diagnosis.")
 
 
 def _advice(diagnosis):
@@ -289,9 +301,15 @@ def _advice(diagnosis):
 def _about(diagnosis):
     summary = diagnosis.summary
     notes = "".join(f"<li>{E(note)}</li>" for note in summary.get("warnings", []))
-    noise = ", ".join(f"{name} {wording.number(value, 2)}" for name, value in summary["noise"].items())
-    train, held = (", ".join(dict.fromkeys(r.name for r in part)) for part in (diagnosis.train, diagnosis.held_out))
-    return _section("The recordings", f"<p>Fitted: {E(train)}.<br>Held out: {E(held)}.<br>Noise (SI): {E(noise)}.</p>",
+    noise = ", ".join(f"{wording.channel_words(name)} {wording.number(value, 2)}" for name, value in summary["noise"].items())
+    train, held = (_names(part) for part in (diagnosis.train, diagnosis.held_out))
+    return _section("The recordings",
+                    f"<p>Fitted: {E(train)}.<br>Held out: {E(held)}.<br>Noise of the sensors (SI): {E(noise)}.</p>",
                     f"<ul>{notes}</ul>" if notes else "",
-                    '<p class="note">Beside this page: diagnosis.json (all numbers) and corrected.xml (the corrected model, for stock '
-                    "MuJoCo).</p>")
+                    '<p class="note">Beside this page: diagnosis.json (all numbers) and corrected.xml (the corrected model, for '
+                    "stock MuJoCo).</p>")
+
+
+def _names(recordings, most=12):
+    names = list(dict.fromkeys(recording.name for recording in recordings))
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

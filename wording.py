@@ -71,7 +71,8 @@ def finding_words(finding):
         values = ", ".join((f"{p['name']} " if len(parameters) > 1 else "") + estimate(p) for p in parameters)
         sentence = f"{place}: {effect} {values} was left out"
     else:
-        values = ", ".join(("" if len(parameters) == 1 and p["name"] in effect else f"{p['name']} ") + change(p) for p in parameters)
+        named = len(parameters) > 1 or parameters[0]["name"] not in effect
+        values = ", ".join((f"{p['name']} " if named else "") + change(p) for p in parameters)
         sentence = f"{place}: {effect}{':' if values[0].isalpha() else ''} {values}"
     return sentence + when_words(finding.get("when"))
 
@@ -110,13 +111,14 @@ def errors(summary):
     unit = "times the noise"
     channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"]}
     if channels:
-        name = max(channels, key=lambda n: np.nan_to_num(abs(channels[n]["before"] - channels[n]["after"]) / channels[n]["floor"]))
-        fit, place = channels[name], " at " + _channel(name)
+        gains = {name: abs(c["before"] - c["after"]) / c["floor"] for name, c in channels.items()}
+        name = max(gains, key=lambda n: np.nan_to_num(gains[n]))
+        fit, place = channels[name], " at " + channel_words(name)
         unit, factor = SMALL.get(fit["unit"], (fit["unit"], 1))
     return *(number(fit[key] * factor, 2) for key in ("before", "after", "floor")), unit, place
 
 
-def _channel(name):
+def channel_words(name):
     """"qpos:elbow" -> "elbow", "qpos:root:rot" -> "root (rotation)"; a joint without a name goes by its index."""
     joint, _, part = name.split(":", 1)[1].partition(":")
     part = {"pos": " (position)", "rot": " (rotation)"}.get(part, f":{part}" if part else "")
