@@ -9,6 +9,7 @@ A residual is (measured - predicted) / noise. Start states are eliminated window
 that what is left of a residual, and of a column, is what no choice of start states can produce.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,7 +83,8 @@ class Problem:
         self.measured_qpos = cut.measured(self.windows, "qpos")
         self.measured_qvel = cut.measured(self.windows, "qvel")
         # A scale, not a noise: it stays clear of zero where the noise is far below what any model can explain.
-        spread = np.nanmedian(np.nanstd(self.measured_qpos, axis=1), axis=0) if self.model.nq == nv else np.zeros(nv)
+        with warnings.catch_warnings(action="ignore"):  # what was never measured has none
+            spread = np.nanmedian(np.nanstd(self.measured_qpos, axis=1), axis=0) if self.model.nq == nv else np.zeros(nv)
         position_noise = np.maximum(position_noise, 1e-3 * np.nan_to_num(spread))
         known = np.isfinite(cut.difference(self.model, self.measured_qpos, self.measured_qpos))
         self.weight = np.concatenate([known / position_noise, np.isfinite(self.measured_qvel) / velocity_noise], -1)
