@@ -21,8 +21,9 @@ class ActuatorEffect(Effect):
         """A typical force of the actuator."""
         if model.actuator_forcelimited[i]:
             return abs(model.actuator_forcerange[i]).max()
-        if model.actuator_ctrllimited[i]:
-            return abs(model.actuator_gainprm[i, 0]) * abs(model.actuator_ctrlrange[i]).max()
+        u = model.actuator_ctrladr[i]
+        if model.actuator_ctrllimited[u]:
+            return abs(model.actuator_gainprm[i, 0]) * abs(model.actuator_ctrlrange[u]).max()
         return abs(model.actuator_gainprm[i, 0])
 
     @staticmethod

@@ -11,8 +11,10 @@ diagnosis was made, whatever it says; 2 bad input or not enough data, with one l
 """
 import argparse
 import dataclasses
+import glob
 import os
 import sys
+import traceback
 
 import gymnasium
 import mujoco
@@ -163,7 +165,8 @@ def main(argv=None):
         with quiet():
             if sys.stderr.isatty():
                 bar = tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", file=sys.stderr)
-            diagnosis = diagnose(args.model or args.env, args.recordings, args.held_out, bar and progress)
+            given, held_out = _expanded(args.recordings), _expanded(args.held_out)
+            diagnosis = diagnose(args.model or args.env, given, held_out, bar and progress)
             report.write(diagnosis, args.out)
     except (recorded.RecordingError, ModelError, report.ReportError, mujoco.FatalError, MemoryError) as error:
         if bar:
@@ -174,10 +177,25 @@ def main(argv=None):
     except KeyboardInterrupt:
         print("\ndiagnose.py: stopped; nothing was written", file=sys.stderr)
         return 130
+    except Exception as error:  # a fault of the program: still no traceback at a user, but the place for who mends it
+        if bar:
+            bar.close()
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        print(f"diagnose.py: a fault of this program, not of its input: {type(error).__name__} in "
+              f"{os.path.basename(place.filename)}, line {place.lineno} ({' '.join(str(error).split())}); please report it",
+              file=sys.stderr)
+        return 2
     if bar:
         bar.close()
+    sys.stdout.reconfigure(errors="replace")  # a terminal that cannot show ± or ∞ still shows the rest
     print(wording.terminal(diagnosis.summary, args.out.rstrip("/")))
     return 0
+
+
+def _expanded(paths):
+    """Patterns that the shell left as they are (Windows' does, and quotes do), replaced by the files they match."""
+    found = ([pattern] if os.path.exists(pattern) else sorted(glob.glob(pattern)) or [pattern] for pattern in paths or [])
+    return [path for some in found for path in some]
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ Nothing is ever unpickled. Every fault raises RecordingError with one line: file
 """
 import csv
 import difflib
+import glob
 import io
 import os
 import stat
@@ -81,8 +82,8 @@ def columns_of(model):
         widths = WIDTHS.get(model.jnt_type[j], (1, 1))
         add("qpos", model.joint(j).name or str(j), widths[0], model.jnt_qposadr[j])
         add("qvel", model.joint(j).name or str(j), widths[1], model.jnt_dofadr[j])
-    for a in range(model.nu):
-        add("ctrl", model.actuator(a).name or str(a), 1, a)
+    for a in range(model.nactuator):  # one without an input has no control, and a few have several
+        add("ctrl", model.actuator(a).name or str(a), model.actuator_ctrlnum[a], model.actuator_ctrladr[a])
     for s in range(model.nsensor):
         place = model.sensor(s).name or str(s)
         for k in range(model.sensor_dim[s]):
@@ -312,6 +313,9 @@ def _minari(path, model):
     """One Recording per episode of a Minari dataset, given by id or by folder."""
     if not os.path.exists(path) and "/" not in path and "-v" not in path:
         raise RecordingError(f"{path}: no such file; check the path")
+    for pattern in ("*.csv", "*.npz"):
+        if glob.glob(os.path.join(glob.escape(path), pattern)):
+            raise RecordingError(f"{path}: a folder; name the files in it, as in {os.path.join(path, pattern)}")
     try:
         import minari
     except ImportError:

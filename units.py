@@ -11,6 +11,7 @@ import numpy as np
 
 import leftover
 from effects import HINGE, SLIDE
+from readers import columns_of
 
 CENTRES = 400  # rows at which the law is tested
 HALVES = leftover.HALF, 4 * leftover.HALF  # s, of the smoothing: for fast motion, and for slow motion under much noise
@@ -73,17 +74,17 @@ def _readings(recording, model, states, half):
     for j in single:
         yield Reading(f"column 'qpos:{names[j]}' seems to have the wrong sign; turn it round", [v[j]], SWAP_GAIN,
                       _scaled(model, states, {j: -1.0}))
-    driving, signs = [a for a in range(model.nu) if _driven(model, a)], 1.0 - 2.0 * np.eye(model.nu)
-    controls = [f"ctrl:{model.actuator(a).name or a}" for a in range(model.nu)]
-    for a in driving:
-        yield Reading(f"column '{controls[a]}' seems to have the wrong sign; turn it round", _driven(model, a), SWAP_GAIN,
+    controls, moments, signs = [c for c in columns_of(model) if c.startswith("ctrl:")], _moments(model), 1.0 - 2.0 * np.eye(model.nu)
+    driven = [np.flatnonzero(moment) for moment in moments]
+    for a, column in enumerate(controls):
+        yield Reading(f"column '{column}' seems to have the wrong sign; turn it round", driven[a], SWAP_GAIN,
                       (*states[:3], states[3] * signs[a]))
-    for a in driving:
-        j = model.actuator_trnid[a, 0]
-        if j in single:
-            yield Reading(f"columns 'qpos:{names[j]}' and '{controls[a]}' do not fit the signs of the others; turn both round, "
-                          "or that joint's axis in the model", _driven(model, a), SWAP_GAIN,
-                          (*_scaled(model, states, {j: -1.0})[:3], states[3] * signs[a]))
+    for a, column in enumerate(controls):
+        for j in single:
+            if driven[a].tolist() == [v[j]]:
+                yield Reading(f"columns 'qpos:{names[j]}' and '{column}' do not fit the signs of the others; turn both round, or "
+                              "that joint's axis in the model", driven[a], SWAP_GAIN,
+                              (*_scaled(model, states, {j: -1.0})[:3], states[3] * signs[a]))
     for i in single:
         for j in single[:single.index(i)]:
             if model.jnt_type[i] == model.jnt_type[j]:
@@ -96,7 +97,7 @@ def _readings(recording, model, states, half):
             order = np.arange(model.nu)
             order[[i, j]] = j, i
             yield Reading(f"columns '{controls[j]}' and '{controls[i]}' seem to be exchanged",
-                          sorted({*_driven(model, i), *_driven(model, j)}), SWAP_GAIN, (*states[:3], states[3][:, order]))
+                          np.flatnonzero(moments[i] - moments[j]), SWAP_GAIN, (*states[:3], states[3][:, order]))
     for j in range(model.njnt):
         if j not in single:
             first = q[j] + (3 if j in free else 0)
@@ -107,11 +108,16 @@ def _readings(recording, model, states, half):
                           list(range(v[j], v[j] + (6 if j in free else 3))), SWAP_GAIN, turned)
 
 
-def _driven(model, actuator):
-    """Dofs of the joint that an actuator drives; none where it drives something else."""
-    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
-        return []
-    return [model.jnt_dofadr[model.actuator_trnid[actuator, 0]]]
+def _moments(model):
+    """(nu, nv) moment arms in the reference pose of the actuator behind each control; small ones count as none."""
+    data, out = mujoco.MjData(model), np.zeros((model.nu, model.nv))
+    mujoco.mj_forward(model, data)
+    for a in range(model.nactuator):
+        row = model.actuator_outadr[a]
+        start, width = data.moment_rowadr[row], data.moment_rownnz[row]
+        for u in range(model.actuator_ctrladr[a], model.actuator_ctrladr[a] + model.actuator_ctrlnum[a]):
+            out[u, data.moment_colind[start:start + width]] = data.actuator_moment[start:start + width]
+    return np.where(np.abs(out) > 1e-9, out, 0.0)
 
 
 def _scaled(model, states, factors):

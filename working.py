@@ -133,8 +133,8 @@ class Working:
     def signal(self, recording, a, u):
         """The nominal Signal of control u of actuator a."""
         value, m = recording.ctrl[:, u], self.nominal
-        if m.actuator_ctrllimited[a] and m.actuator_ctrlnum[a] == 1:
-            value = np.clip(value, *m.actuator_ctrlrange[a])
+        if m.actuator_ctrllimited[u]:
+            value = np.clip(value, *m.actuator_ctrlrange[u])
         return Signal(recording.time, value, nominal_delay(m, a))
 
     def activation(self, recording, start):

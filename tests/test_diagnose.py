@@ -153,6 +153,34 @@ def test_progress_is_for_terminals(terminal, tmp_path, capsys, monkeypatch):
     assert err.endswith("diagnose.py: enough\n") and ("searching" in err and "50%" in err) == terminal
 
 
+def test_a_fault_of_the_program_is_one_line_too(tmp_path, capsys, monkeypatch):
+    def break_down(*args):
+        raise np.linalg.LinAlgError("Singular\nmatrix")
+    monkeypatch.setattr(diagnose, "diagnose", break_down)
+    assert diagnose.main(CASES["empty file"].write(tmp_path)) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("diagnose.py: a fault of this program, not of its input: LinAlgError in test_diagnose.py, line ")
+    assert err.count("\n") == 1 and "(Singular matrix)" in err
+
+
+def test_patterns_that_the_shell_left_are_expanded(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("run2.csv", "run1.csv", "[odd].csv"):
+        (tmp_path / name).write_text("")
+    assert diagnose._expanded(["run*.csv", "[odd].csv", "none*.csv"]) == ["run1.csv", "run2.csv", "[odd].csv", "none*.csv"]
+    assert diagnose._expanded(None) == []
+
+
+def test_a_terminal_that_cannot_show_a_sign(command):
+    folder, _ = command
+    done = subprocess.run([sys.executable, "-c", "import sys; sys.path.insert(0, sys.argv[1]); import diagnose, types, json; "
+                           "s = json.load(open('report/diagnosis.json')); diagnose.report.write = lambda *a: None; "
+                           "diagnose.diagnose = lambda *a: types.SimpleNamespace(summary=s); "
+                           "sys.exit(diagnose.main(['--model', 'sim.xml', '--recordings', 'run0.csv', '--out', 'x']))", ROOT],
+                          capture_output=True, cwd=folder, env={**os.environ, "PYTHONIOENCODING": "ascii"})
+    assert done.returncode == 0 and b"Coulomb friction 0.15" in done.stdout and done.stderr == b"", done.stderr
+
+
 # --- words ---
 
 def parameter(name, nominal, value, half, unit):

@@ -97,6 +97,12 @@ def test_free_ball_and_sensor_columns(tmp_path):
         load(put(tmp_path, text(table, ["time", "qpos:cube", *header[2:]])), model)
 
 
+def test_an_actuator_without_input_has_no_control():
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><actuator>
+        <dcmotor name="drag" joint="j" input="none" motorconst=".1 .1" resistance="1"/><motor name="m" joint="j"/></actuator></mujoco>""")
+    assert list(columns_of(model)) == ["qpos:j", "qvel:j", "ctrl:m"]
+
+
 def test_sensors(tmp_path, model, good):
     got, = load(put(tmp_path, text(np.column_stack([good, good[:, 1]]), [*HEADER, "sensor:encoder"])), model)
     np.testing.assert_allclose(got.sensors["encoder"], good[:, 1:2], rtol=1e-8)
@@ -272,7 +278,7 @@ BODY = """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1"><freejo
 
 @pytest.mark.parametrize("spoil, says", [
     (lambda q, u: (q, u), None), (lambda q, u: (q[:, [0, 1, 2, 4, 5, 6, 3]], u), "x y z w"),
-    (lambda q, u: (q * [1000, 1000, 1000, 1, 1, 1, 1], u), "in mm"), (lambda q, u: (q, u[:, ::-1]), None)])
+    (lambda q, u: (q * [1000, 1000, 1000, 1, 1, 1, 1], u), "in mm"), (lambda q, u: (q, u[:, ::-1]), "ctrl:a.*ctrl:b.*exchanged")])
 def test_a_free_body_in_another_convention(spoil, says):
     model = mujoco.MjModel.from_xml_string(BODY)
     data, qpos, ctrl = mujoco.MjData(model), [], []
