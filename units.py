@@ -74,7 +74,8 @@ def _readings(recording, model, states, half):
     for j in single:
         yield Reading(f"column 'qpos:{names[j]}' seems to have the wrong sign; turn it round", [v[j]], SWAP_GAIN,
                       _scaled(model, states, {j: -1.0}))
-    controls, moments, signs = [c for c in columns_of(model) if c.startswith("ctrl:")], _moments(model), 1.0 - 2.0 * np.eye(model.nu)
+    controls, signs = [c for c in columns_of(model) if c.startswith("ctrl:")], 1.0 - 2.0 * np.eye(model.nu)
+    moments = _moments(model)
     driven = [np.flatnonzero(moment) for moment in moments]
     for a, column in enumerate(controls):
         yield Reading(f"column '{column}' seems to have the wrong sign; turn it round", driven[a], SWAP_GAIN,
