@@ -77,6 +77,13 @@ def _readings(recording, model, states, half):
     controls, signs = [c for c in columns_of(model) if c.startswith("ctrl:")], 1.0 - 2.0 * np.eye(model.nu)
     moments = _moments(model)
     driven = [np.flatnonzero(moment) for moment in moments]
+    gears = np.abs(model.actuator_gear[np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum)]).max(axis=1, initial=1e-9)
+    for divisor, what in ((gears, "forces in the joints; divide each by its actuator's gear"),  # the smaller first: nearly
+                          (100.0, "100 times too large for the model (percent?)"),              # no control fits well, too
+                          (1000.0, "1000 times too large for the model")):
+        if np.any(divisor != 1.0):
+            yield Reading(f"the 'ctrl:' columns seem to be {what}", np.flatnonzero(moments.any(axis=0)), SWAP_GAIN,
+                          (*states[:3], states[3] / divisor))
     for a, column in enumerate(controls):
         yield Reading(f"column '{column}' seems to have the wrong sign; turn it round", driven[a], SWAP_GAIN,
                       (*states[:3], states[3] * signs[a]))

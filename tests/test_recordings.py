@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from readers import columns_of
 from recordings import Recording, RecordingError, check, load
-from tests.malformed import HEADER, archive, arm, run, text, whole
+from tests.malformed import ARM, HEADER, archive, arm, run, text, whole
 
 REAL = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "shared", "recordings")
 FREE = """
@@ -262,6 +262,17 @@ def test_signs_and_columns_that_the_model_cannot_follow(model, spoil, says):
     table[:, 3:5] = np.nan
     with pytest.raises(RecordingError, match=says):
         check([recording(table)], model)
+
+
+@pytest.mark.parametrize("factor, gear, says", [(1000, 1, "1000 times too large"), (100, 1, "percent"), (1, 50, "actuator's gear"), (1, 1, None)])
+def test_controls_in_another_unit(good, factor, gear, says):
+    model = mujoco.MjModel.from_xml_string(ARM.replace('ctrllimited="true"', f'gear="{gear}" ctrllimited="false"'))
+    table = good * [1, 1, 1, 1, 1, factor, factor]
+    if says is None:
+        check([recording(table)], model)
+    else:
+        with pytest.raises(RecordingError, match=says):
+            check([recording(table)], model)
 
 
 def test_a_joint_that_sticks_is_not_in_degrees(model, good):
