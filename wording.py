@@ -105,14 +105,14 @@ def depends_words(depends_on):
 
 
 def errors(summary):
-    """Held-out error as words (before, after, floor, unit, place): in SI at the channel in which the two models differ
+    """Held-out error as words (before, after, floor, unit, place): in SI at the channel that the correction betters
     most, or, where they are the same, which is farthest from a perfect one; or over all channels in multiples of the noise."""
     fit, place, factor = summary["fit"]["held_out"], "", 1
     unit = "times the noise"
     channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"]}
     if channels:
         match = summary["verdict"] == "match"
-        gains = {name: (c["before"] if match else abs(c["before"] - c["after"])) / c["floor"] for name, c in channels.items()}
+        gains = {name: (c["before"] if match else c["before"] - c["after"]) / c["floor"] for name, c in channels.items()}
         name = max(gains, key=lambda n: np.nan_to_num(gains[n]))
         fit, place = channels[name], " at " + channel_words(name)
         unit, factor = SMALL.get(fit["unit"], (fit["unit"], 1))
@@ -130,8 +130,9 @@ def error_words(summary):
     """"held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; a perfect simulator's would be 1, from noise in ..."."""
     before, after, floor, unit, place = errors(summary)
     ahead = f"held-out error {summary['fit']['held_out'].get('horizon_s', 0.3):g} s ahead"
+    fit = summary["fit"]["held_out"]
     change = (f"is {before} {unit}" if summary["verdict"] == "match" else f"stays at {after} {unit}" if before == after else
-              f"falls from {before} to {after} {unit}")
+              f"{'falls' if fit['after'] < fit['before'] else 'goes'} from {before} to {after} {unit}")
     return f"{ahead} {change}{place}; a perfect simulator would show {floor}, for it too starts from noisy measurements"
 
 
