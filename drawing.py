@@ -100,8 +100,10 @@ def marked(model, place):
         joint = _id(model.joint, name)
     elif kind == "actuator":
         actuator = _id(model.actuator, name)
-        if actuator is not None and model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
-            joint = int(model.actuator_trnid[actuator, 0])
+        if actuator is not None:
+            joint, site = _end(model, actuator)
+            if site is not None:
+                return [], lambda data: data.site_xpos[site]
     elif kind == "sensor":
         sensor = _id(model.sensor, name)
         if sensor is not None and model.sensor_objtype[sensor] == mujoco.mjtObj.mjOBJ_JOINT:
@@ -118,6 +120,17 @@ def marked(model, place):
         if body is not None:
             return list(np.flatnonzero(model.geom_bodyid == body)), lambda data: data.xipos[body]
     return [], (None if joint is None else lambda data: data.xanchor[joint])
+
+
+def _end(model, actuator):
+    """(joint id, None) or (None, site id) that an actuator pulls at, of a tendon the last; (None, None) for any other."""
+    kind, i = mujoco.mjtTrn(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    joint, site = kind == mujoco.mjtTrn.mjTRN_JOINT, kind == mujoco.mjtTrn.mjTRN_SITE
+    if kind == mujoco.mjtTrn.mjTRN_TENDON:
+        last = model.tendon_adr[i] + model.tendon_num[i] - 1
+        wrap, i = mujoco.mjtWrap(model.wrap_type[last]), int(model.wrap_objid[last])
+        joint, site = wrap == mujoco.mjtWrap.mjWRAP_JOINT, wrap == mujoco.mjtWrap.mjWRAP_SITE
+    return (i if joint else None), (i if site else None)
 
 
 def _id(named, name):

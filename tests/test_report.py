@@ -258,6 +258,20 @@ def test_overlay_finds_recorded_joints_in_a_model_with_more(diagnosis):
     assert qpos.tolist() == [0, 2] == dof.tolist()
 
 
+def test_marks_of_actuators_that_drive_no_joint():
+    """A thruster is marked at its site, a tendon at its end, and one that drives a body nowhere."""
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><site name="wall" pos="1 0 0"/><body name="b" pos="0 0 .5"><joint name="j"/>
+        <geom size=".1"/><site name="rotor" pos=".3 0 0"/></body></worldbody><tendon><spatial name="t"><site site="wall"/><site site="rotor"/>
+        </spatial><fixed name="f"><joint joint="j" coef="1"/></fixed></tendon><actuator><motor name="thrust" site="rotor"/><motor name="rope"
+        tendon="t"/><motor name="belt" tendon="f"/><adhesion name="glue" body="b" ctrlrange="0 1"/></actuator></mujoco>""")
+    data = drawing._posed(model, model.qpos0)
+    points = {}
+    for name in ("thrust", "rope", "belt", "glue"):
+        _, point = drawing.marked(model, {"kind": "actuator", "name": name})
+        points[name] = None if point is None else point(data).tolist()
+    assert points == {"thrust": [0.3, 0, 0.5], "rope": [0.3, 0, 0.5], "belt": [0, 0, 0.5], "glue": None}
+
+
 def test_leftover_force_is_the_one_that_was_left_out():
     """Recorded with viscous damping 0.3, nominal without: the residual is -0.3 times the velocity, the corrected one's none."""
     def made(damping):
