@@ -24,6 +24,7 @@ from tqdm import tqdm
 import recordings as recorded
 import report
 import wording
+from defects import without_defects
 from identify import identify
 from world import World, quiet
 
@@ -45,8 +46,10 @@ def diagnose(model, recordings, held_out=None, progress=None):
     """
     world = _world(model)
     train, held = _recordings(recordings, held_out, world.model)
-    notes = recorded.check(train + held, world.model)
-    notes += _runs(world.model, train + held)
+    given, notes = without_defects(train + held, world.model)
+    train, held = given[:len(train)], given[len(train):]
+    notes += recorded.check(given, world.model)
+    notes += _runs(world.model, given)
     if not held:
         train, held = split(train)
     diagnosis = identify(world, train, held, progress=progress)

@@ -157,6 +157,11 @@ def check(recordings, model):
         doubt = suspect(recording, model)
         if doubt:
             raise RecordingError(f"{recording.name}: {doubt}")
+    return grouped(found)
+
+
+def grouped(found):
+    """{message: [(recording's name, share of its rows), ...]} in lines, one for all recordings; "{}" becomes the share."""
     return [f"{places[0][0]}{_more(places)}: {message.replace('{}', _share(places))}" for message, places in found.items()]
 
 

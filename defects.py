@@ -1,0 +1,90 @@
+"""Rows that only look measured: sensors that repeat their last value, drop out or spike. They become "not measured".
+
+    recordings, notes = without_defects(recordings, model)
+
+A joint has inertia: it does not jump away and come back within three rows, nor stand still and catch up in one. What a
+coarse encoder does at slow speed (repeat, then move on by one count), what a joint at rest does and what an impact does
+(a new velocity, not a new position) stays. Velocities may jump, so in them only repeats count.
+"""
+from dataclasses import replace
+
+import numpy as np
+
+from readers import WIDTHS
+from recordings import grouped
+
+AWAY = 10  # a spike is so many times as large as nearly all changes from row to row
+LONGEST = 3  # rows of a spike; what lasts longer may be real
+CATCH_UP = 2  # the change after repeated values, in the one that follows it: above, they were stale
+COUNTS = 3  # of the encoder: changes up to these are its resolution
+
+
+def without_defects(recordings, model):
+    """(recordings with nan where a defect was, [one line for each joint and kind of defect])."""
+    out, found = [], {}
+    for recording in recordings:
+        arrays = {"qpos": recording.qpos.copy(), "qvel": recording.qvel.copy()}
+        for kind, name, columns in _channels(model):
+            for find, what in ((_spikes, "jumps away and back"), (_repeats, "repeats its last value and then catches up")):
+                rows = find(arrays[kind][:, columns]) if kind == "qpos" or find is _repeats else np.zeros(1, bool)
+                if rows.any():
+                    arrays[kind][np.ix_(rows, columns)] = np.nan
+                    message = f"{kind}:{name} {what} in {{}} of its rows, which count as not measured"
+                    found.setdefault(message, []).append((recording.name, rows.mean()))
+        out.append(replace(recording, **arrays))
+    return out, grouped(found)
+
+
+def _channels(model):
+    """(qpos or qvel, joint, its columns) of every joint: what one sensor measures at once."""
+    for j in range(model.njnt):
+        nq, nv = WIDTHS.get(model.jnt_type[j], (1, 1))
+        for kind, first, width in (("qpos", model.jnt_qposadr[j], nq), ("qvel", model.jnt_dofadr[j], nv)):
+            yield kind, model.joint(j).name or str(j), list(range(first, first + width))
+
+
+def _spikes(values):
+    """(T,) rows in which values (T, k) leave the motion, at most LONGEST at a time, and come back to it."""
+    found = np.zeros(len(values), bool)
+    rows = np.flatnonzero(np.isfinite(values).all(axis=1))
+    if len(rows) < 20:
+        return found
+    x = values[rows]
+    change = np.abs(np.diff(x, axis=0)).max(axis=1)
+    if not change.any():
+        return found
+    usual = np.quantile(change[change > 0], 0.95)
+    k = 1
+    while k < len(x) - 1:
+        if change[k - 1] > AWAY * usual and abs(change[k - 1] - 2 * np.pi) > 0.1:  # else an angle wraps
+            for end in range(k + 1, min(k + LONGEST, len(x) - 1) + 1):
+                if np.abs(x[end] - x[k - 1]).max() <= (end - k + 1) * usual < change[end - 1]:
+                    found[rows[k:end]] = True
+                    k = end
+                    break
+        k += 1
+    return found
+
+
+def _repeats(values):
+    """(T,) rows in which values (T, k) are the row before's to the last digit, though the next new one is far from it."""
+    found = np.zeros(len(values), bool)
+    rows = np.flatnonzero(np.isfinite(values).all(axis=1))
+    if len(rows) < 20:
+        return found
+    change = np.abs(np.diff(values[rows], axis=0)).max(axis=1)
+    same = change == 0
+    if same.all() or not same.any():
+        return found
+    count = change[~same].min()
+    if same.sum() <= 3 * np.count_nonzero(change[~same] < 1.5 * count):  # repeats by chance, of a coarse and noisy sensor
+        return found
+    begin = np.flatnonzero(same & ~np.append(False, same[:-1]))  # change[k] is between rows k and k + 1
+    for first in begin:
+        last = first
+        while last < len(same) and same[last]:
+            last += 1
+        following = change[last + 1] if last + 1 < len(change) else np.inf
+        if last < len(change) and change[last] > COUNTS * count and change[last] > CATCH_UP * following:
+            found[rows[first + 1:last + 1]] = True
+    return found
