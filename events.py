@@ -29,6 +29,7 @@ class Event:
     p_value: float
     fit: object = None  # shooting.Fit on the windows around it
     problem: object = None
+    left: float = 0.0  # squared residual of all windows with it
     others: list = field(default_factory=list)  # [(candidate, values)] that explain it as well
 
     @property
@@ -129,7 +130,7 @@ def refined(world, problem, fit, event, timed):
             bounds, values = trials[best], fits[best].hypothesis.effects[-1][1]
             start = fits[best]
     event.candidate, event.values, event.time = start.hypothesis.candidates[-1], values, tuple(bounds)
-    event.fit, event.problem = start, local
+    event.fit, event.problem, event.left = start, local, float(np.delete(fit.chi2, near).sum() + start.chi2.sum())
     return event
 
 

@@ -8,6 +8,7 @@ The error is the contract's (windows.error): consecutive windows, start as recor
 
 import numpy as np
 
+import scores
 import shooting
 import windows as cut
 
@@ -28,21 +29,58 @@ def prediction_error(world, settings, recordings, noise, horizon=cut.HORIZON):
     return cut.error(world.model, windows, predict(world, settings, windows)[0], noise)
 
 
+def crossed(search, fit, windows, position_noise):
+    """Reported error of windows, before and after, each predicted with the values that the other recordings say.
+
+    Where there is but one recording: the other thirds of it. The values without some are one step from the fit's.
+    """
+    recordings = list({id(w.recording): w.recording for w in windows}.values())
+
+    def block(w):
+        if len(recordings) > 1:
+            return next(i for i, r in enumerate(recordings) if r is w.recording)
+        return min(3 * w.first // len(w.recording.time), 2)
+
+    slope, moves = search.slopes(fit)
+    scan, owner = shooting.project(search.problem, fit, slope), np.array([block(w) for w in search.problem.windows])
+    low, high = (np.array([getattr(p, bound) for p in fit.hypothesis.parameters]) for bound in ("low", "high"))
+    noise, square = reporting_noise(position_noise), np.zeros(2)
+    for b in np.unique([block(w) for w in windows]):
+        others, mine = owner != b, [w for w in windows if block(w) == b]
+        if not others.any():
+            continue
+        shift = scores.solve_small(scan.gram[others].sum(0), scan.score[others].sum(0))
+        moved = fit.hypothesis.moved(np.clip(fit.hypothesis.vector + moves * shift, low, high)).settings
+        for k, settings in enumerate(({}, moved)):
+            error, _ = cut.error(search.model, mine, predict(search.world, settings, mine)[0], noise)
+            square[k] += len(mine) * error**2
+    return np.sqrt(square)
+
+
 def floor_error(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, seed=0):
     """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}).
 
-    The corrected model from fitted start states stands for the truth; it is predicted from the recorded start states,
-    which carry noise and the error of a central difference, and compared with fresh noise added.
+    The corrected model from fitted start states stands for the truth, from one row before each window on. It is measured
+    anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities by differences.
     """
     rng, model = np.random.default_rng(seed), world.model
     windows = consecutive(recordings, horizon)
     windows = windows[:: -(-len(windows) // 100)]
-    problem = shooting.Problem(world, windows, position_noise, velocity_noise)
+    early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
+    problem = shooting.Problem(world, early, position_noise, velocity_noise)
     fit = shooting.fit_starts(problem, shooting.Hypothesis(tuple(settings.items())), iterations=4)
-    truth = predict(world, settings, windows, (fit.qpos, fit.qvel))[0]
+    truth, speed = predict(world, settings, early, (fit.qpos, fit.qvel))
     finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
     noisy = cut.integrate(model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,)))
-    gap = cut.difference(model, predict(world, settings, windows)[0], noisy)[:, 1:]
+    every, at = np.arange(len(windows)), np.array([w.first - e.first for w, e in zip(windows, early)])
+    seconds = np.array([w.recording.time[w.first + 1] - w.recording.time[e.first] for w, e in zip(windows, early)])
+    start = cut.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds[:, None]
+    measured = np.array([np.isfinite(w.recording.qvel[w.first]) for w in windows])
+    spread = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0) * rng.normal(size=start.shape)
+    start = np.where(measured, speed[every, at] + spread, start)
+    predicted = predict(world, settings, windows, (noisy[every, at], start))[0]
+    rows = np.minimum(np.arange(1, predicted.shape[1]) + at[:, None], noisy.shape[1] - 1)
+    gap = cut.difference(model, predicted[:, 1:], noisy[every[:, None], rows])
     known = np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows)))[:, 1:] & np.isfinite(gap)
     square = np.where(known, gap**2, 0.0)
     per_channel = {name: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))

@@ -11,14 +11,12 @@
 Held-out recordings enter only after everything is chosen and fitted.
 """
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 
 import events
 import evidence
-import scores
+import findings
 import selection
 import shooting
 import unknown
@@ -28,23 +26,12 @@ from recordings import RecordingError
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
 FINAL_STEPS = 30000
 LEAST_ROWS, LEAST_WINDOWS, FEW_ROWS = 8, 20, 100
-LEFTOVER_SPANS, LEFTOVER_WORTH = (0.2, 0.1), 0.05  # s; share of the nominal's squared residual that a leftover must explain
-SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
+LEFTOVER_SPANS = 0.2, 0.1  # s
+STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up to which the curve does without them
+WORSE = 0.02  # of the reported error: more is no accident
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    summary: dict  # diagnosis.json
-    corrected_xml: str
-    world: object
-    settings: dict  # {Candidate: values}
-    ranking: list
-    traces: list
-    train: list  # Recordings
-    held_out: list
 
 
 def identify(world, train, held_out, progress=None):
@@ -56,36 +43,30 @@ def identify(world, train, held_out, progress=None):
     say = progress or (lambda done, message: None)
     say(0.0, "estimating noise")
     position_noise, velocity_noise = noise_of(world, train)
-    event, hypothesis = None, shooting.Hypothesis()
-    for attempt in range(2):  # what came and went for a while would be mistaken for something that always acts
-        data = world, train, position_noise, velocity_noise, event
-        problem = problem_of(*data, LEFTOVER_SPANS[0], FINAL_STEPS)
-        found = None if event else events.find(world, problem, shooting.fit_starts(problem, hypothesis))
-        event = event or found
-        if attempt and not found:
-            break
+    data = world, train, position_noise, velocity_noise, None
+    search, fit, ranking, span = searched(data, say)
+    event = happened(data, fit.hypothesis)
+    if event:  # what lasts is searched again where it was not disturbed
         data = world, train, position_noise, velocity_noise, event
         search, fit, ranking, span = searched(data, say)
-        hypothesis = fit.hypothesis
-        if event:
-            break
     say(0.6, "alternatives")
     fit, possible = search.settle(fit)
     hypothesis = fit.hypothesis
     say(0.75, "testing for anything left")
-    hypothesis, left = anything_left(data, search, hypothesis)
+    hypothesis, left, hint = anything_left(data, search, hypothesis)
     say(0.8, "intervals")
     final = selection.Search(world, problem_of(*data, span, FINAL_STEPS), train)
     fit = shooting.fit_starts(final.problem, hypothesis)
     if hypothesis.effects:
         [fit] = shooting.solve(final.problem, [hypothesis], fit)
         fit = final.drop(fit, ())
+        fit = generalising(final, fit, windows_for(world, train, cut.HORIZON, FINAL_STEPS, event), position_noise)
         hypothesis = fit.hypothesis
-    if left and left.simulable and not any(c.effect.name == "unknown" for c in hypothesis.candidates):
-        left = None
+    if left and left.candidate not in hypothesis.candidates:
+        left, hint = None, left
     say(0.9, "held-out error")
     position_noise, velocity_noise = lowered_noise(world, train, position_noise, velocity_noise, hypothesis)
-    return assemble(world, train, held_out, fit, final, possible, left, event, ranking,
+    return findings.assemble(world, train, held_out, fit, final, possible, left, hint, event, ranking,
                     position_noise, velocity_noise)
 
 
@@ -207,182 +188,51 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
     return span
 
 
+def happened(data, hypothesis):
+    """What came and went for a while, beside what lasts or instead of it: an Event, if it leaves less; else None."""
+    problem = problem_of(*data, LEFTOVER_SPANS[0], FINAL_STEPS)
+    lasting, found = shooting.fit_starts(problem, hypothesis), []
+    for h in {hypothesis, shooting.Hypothesis()}:
+        event = events.find(data[0], problem, lasting if h == hypothesis else shooting.fit_starts(problem, h))
+        if event and event.left < (1 - STAND_IN) * lasting.chi2.sum():
+            found.append(event)
+    return min(found, key=lambda e: e.left) if found else None
+
+
 def anything_left(data, search, hypothesis):
-    """(hypothesis, Leftover or None): the residual's dependence on position, velocity, control and time.
+    """(hypothesis, large Leftover or None, small one or None): what the residual depends on.
 
-    Named effects that only stood in for the leftover curve go.
+    Named effects that only stood in for it go, all of them or one after the other: where it explains as much without
+    them, and much more than they do without it.
     """
-    for span in LEFTOVER_SPANS:
-        problem = problem_of(*data, span, FINAL_STEPS)
-        bare = shooting.fit_starts(problem, shooting.Hypothesis()).chi2.sum()
-
-        def look(h):
-            fit = shooting.fit_starts(problem, h)
-            found = unknown.leftover(search, problem, fit, LEFTOVER_WORTH * bare)
-            return found, fit.chi2.sum() * (1 - found.share if found else 1.0)
-
-        found, rest = look(hypothesis)
-        if found is None:
+    hint = None
+    for problem in [search.problem] + [problem_of(*data, span, FINAL_STEPS) for span in LEFTOVER_SPANS]:
+        bare = shooting.fit_starts(problem, shooting.Hypothesis())
+        fit = shooting.fit_starts(problem, hypothesis) if hypothesis.effects else bare
+        found = unknown.leftover(search, problem, fit, bare.chi2.sum())
+        hint = hint or found
+        if not found or not found.large:
             continue
-        for candidate in hypothesis.candidates:
-            again, alone = look(hypothesis.minus(candidate))
-            if again and again.joint == found.joint and alone - rest < 0.1 * (bare - rest):
-                hypothesis, found, rest = hypothesis.minus(candidate), again, alone
-        curve = found.candidate(data[0])
-        return (hypothesis.plus(curve, found.force) if curve else hypothesis), found
-    return hypothesis, None
+        curve, named = found.candidate, fit.chi2.sum()
+        [fit] = shooting.solve(problem, [hypothesis.plus(curve, curve.nominal)], fit)
+        for gone in [hypothesis.candidates] + [(c,) for c in hypothesis.candidates]:
+            shorter = shooting.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in gone))
+            if len(shorter.effects) < len(fit.hypothesis.effects):
+                shorter = shorter.plus(curve, curve.nominal)
+                [less] = shooting.solve(problem, [shorter], bare if len(shorter.effects) == 1 else fit)
+                rest = fit.chi2.sum()
+                if less.chi2.sum() < rest + min(STAND_IN * (bare.chi2.sum() - rest), 0.5 * (named - rest)):
+                    fit = less
+        return fit.hypothesis, found, None
+    return hypothesis, None, hint
 
 
-# ---- report ------------------------------------------------------------------------------------
-
-
-def intervals(search, fit):
-    """{candidate: [(low, high), ...]}: 95 %, from the spread between clusters of windows, and the time step's error."""
-    if not fit.hypothesis.effects:
-        return {}
-    slope, moves = search.slopes(fit)
-    scan = shooting.project(search.problem, fit, slope, search.pieces)
-    gram, score = scores.summed(search.labels, scan.gram), scores.summed(search.labels, scan.score)
-    seen = np.diag(gram.sum(0)) > shooting.UNSEEN
-    covariance = scores.sandwich(gram[:, seen][:, :, seen], score[:, seen], np.zeros(seen.sum()))
-    half = np.full(len(moves), np.inf)
-    half[seen] = scores.t_quantile(max(len(gram) - seen.sum(), 1)) * np.sqrt(np.diag(covariance)) * np.abs(moves[seen])
-    # the integrator's own error: how far the values would move with half the time step
-    finer = search.problem.refined(fit)
-    shift = scores.solve_small(gram.sum(0)[np.ix_(seen, seen)], shooting.project(
-        search.problem, finer, slope, search.pieces).score.sum(0)[seen] - score.sum(0)[seen])
-    half[seen] = np.hypot(half[seen], shift * moves[seen])
-    out, at = {}, 0
-    for c, values in fit.hypothesis.effects:
-        out[c] = [(max(v - h, p.low), min(v + h, p.high)) for v, h, p in zip(values, half[at:], c.parameters)]
-        at += len(values)
-    return out
-
-
-def place_of(candidate):
-    return {"kind": candidate.place.kind, "name": candidate.place.name}
-
-
-def parameters_of(candidate, values, bounds=None):
-    out = []
-    for i, (p, v) in enumerate(zip(candidate.parameters, values)):
-        entry = {"name": p.name, "nominal": float(p.nominal), "value": float(v), "unit": p.unit}
-        if bounds:
-            entry["low"], entry["high"] = (float(b) for b in bounds[i])
-        out.append(entry)
-    return out
-
-
-def noise_by_channel(model, position_noise):
-    return {name: float(np.sqrt(np.mean(position_noise[dofs] ** 2))) for name, dofs in cut.channels(model).items()
-            if np.isfinite(position_noise[dofs]).all()}
-
-
-def assemble(world, train, held_out, fit, search, possible, left, event, ranking, position_noise, velocity_noise):
-    settings, model = fit.hypothesis.settings, world.model
-    noise = evidence.reporting_noise(position_noise)
-    bounds = intervals(search, fit)
-    held = held_out or train
-    before, after = (evidence.prediction_error(world, s, held, noise)[0] for s in ({}, settings))
-    findings = []
-    xml, written = world.corrected_xml(settings)
-    for candidate, values in fit.hypothesis.effects:
-        without = evidence.prediction_error(world, fit.hypothesis.minus(candidate).settings, held, noise)[0]
-        curve = candidate.effect.name == "unknown"
-        findings.append({
-            "effect": candidate.effect.name, "place": place_of(candidate),
-            "parameters": parameters_of(candidate, values, bounds[candidate]),
-            "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
-                         "p_value": search.significance(fit, candidate)[0]},
-            "depends_on": list(left.variables) if curve else depends_on(model, candidate), "when": None, "written_as": written[candidate],
-            "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible.get(candidate, []))})
-    if left and not left.simulable:  # found, but no curve of one variable: nothing to simulate
-        findings.append({"effect": "unknown", "place": {"kind": "joint", "name": left.joint}, "parameters": [],
-                         "evidence": {"held_out_error_removed": 0.0, "p_value": left.p_value, "residual_explained": left.share},
-                         "depends_on": list(left.variables), "when": None, "written_as": "none", "also_possible": []})
-    if event:
-        findings.append(event_finding(event, train))
-    findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
-    figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
-               "held_out": figure(world, settings, held, position_noise, velocity_noise)}
-    figures["held_out"]["horizon_s"] = cut.HORIZON
-    figures["held_out"]["curve"] = evidence.curve(world, {"before": {}, "after": settings}, held, noise)
-    floor = figures["held_out"]["floor"]
-    summary = {"format": 1, "verdict": "mismatch" if findings else "match",
-               "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,
-               "unexplained": {"fraction": float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1)),
-                               "place": None, "depends_on": []}}
-    return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
-                     train, held)
-
-
-def event_finding(event, train):
-    local = selection.Search(event.problem.world, event.problem, train)
-    candidate = event.candidate
-    named = lambda c, values, bounds=None: {"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, values, bounds)}
-    return {**named(candidate, event.values, intervals(local, event.fit)[candidate]),
-            "evidence": {"held_out_error_removed": 0.0, "p_value": event.p_value},
-            "depends_on": ["time"], "when": event.when, "written_as": "none",
-            "also_possible": [named(c, values) for c, values in event.others]}
-
-
-def figure(world, settings, recordings, position_noise, velocity_noise):
-    noise, channels, out = evidence.reporting_noise(position_noise), {}, {}
-    for name, s in (("before", {}), ("after", settings)):
-        out[name], per_channel = evidence.prediction_error(world, s, recordings, noise)
-        for channel, value in per_channel.items():
-            channels.setdefault(channel, {})[name] = value
-    out["floor"], per_channel = evidence.floor_error(world, settings, recordings, position_noise, velocity_noise)
-    for channel, value in per_channel.items():
-        channels[channel]["floor"] = value
-        channels[channel]["unit"] = unit_of(world.model, channel)
-    out["channels"] = channels
-    return out
-
-
-def unit_of(model, channel):
-    for j, kind, _, _ in cut.joint_slices(model):
-        name = "qpos:" + cut.joint_name(model, j)
-        if channel == name + ":pos" or (channel == name and kind.name == "mjJNT_SLIDE"):
-            return "m"
-    return "rad"
-
-
-# What the force of an effect varies with.
-VARIABLES = {"velocity": ("viscous_damping", "quadratic_damping", "coulomb_friction", "stribeck_friction", "back_emf"),
-             "position": ("stiffness", "nonlinear_stiffness", "joint_stop", "backlash", "cogging"),
-             "control": ("gain", "saturation", "dead_zone", "delay", "lag"),
-             "contact": ("contact_friction", "contact_stiffness", "contact_damping", "ground_height")}
-
-
-def depends_on(model, candidate):
-    variable = next((v for v, names in VARIABLES.items() if candidate.effect.name in names), None)
-    name = candidate.place.name
-    if variable == "velocity" and candidate.place.kind == "actuator":
-        name = cut.joint_name(model, model.actuator(name).trnid[0])
-    return [f"{variable}:{name}"] if variable else []
-
-
-def also_possible(world, train, noise, hypothesis, candidate, others, most=3):
-    """The alternatives that leave the reported error, on the data they were fitted to, within 5 % of the finding's."""
-    windows = evidence.consecutive(train, cut.HORIZON)
-    windows = windows[:: -(-len(windows) // 60)]
-    rms = lambda settings: cut.error(world.model, windows, evidence.predict(world, settings, windows)[0], noise)[0]
-    out, best = [], rms(hypothesis.settings) if others else 0.0
-    for _, other, values in others:
-        if len(out) < most and rms(hypothesis.minus(candidate).plus(other, values).settings) < (1 + SAME) * best:
-            out.append({"effect": other.effect.name, "place": place_of(other), "parameters": parameters_of(other, values)})
-    return out
-
-
-def ranking_rows(trials, fit):
-    """Best option of every candidate in the first scan: share of the squared residual it removes, and its p-value."""
-    rows, seen = [], set()
-    for t in trials:
-        c = t.option.candidate
-        if c in seen:
-            continue
-        seen.add(c)
-        rows.append({"effect": c.effect.name, "place": place_of(c), "error_removed": float(t.gain / t.chi2), "p_value": t.p_value,
-                     "chosen": c in fit.hypothesis.candidates})
-    return rows[:40]
+def generalising(search, fit, windows, position_noise):
+    """The fit without the effects that predict what they were not fitted to worse than the nominal model does."""
+    while fit.hypothesis.effects:
+        before, after = evidence.crossed(search, fit, windows, position_noise)
+        if not after > (1 + WORSE) * before:
+            break
+        weakest = max(fit.hypothesis.candidates, key=lambda c: search.significance(fit, c)[0])
+        [fit] = shooting.solve(search.problem, [fit.hypothesis.minus(weakest)], fit)
+    return fit

@@ -1,11 +1,11 @@
 """Is anything left, and on what does it depend? The residual force in each joint against position, velocity, control, time.
 
-    found = leftover(search, fit, nominal_chi2)          # None, or a Leftover
-    found.candidate(world)                               # the `unknown` effect that models it, or None
+    found = leftover(search, problem, fit, least)        # None, or a Leftover
+    found.candidate                                      # the `unknown` effect that models it
 
-In short windows an extra joint force is nearly constant, and its column is that of a constant force. A force that is
-some curve of a variable x has, in window w, the column curve(x_w) * (constant force); so all curves of all variables
-are tested from one column per joint, with the start states and the named effects projected out.
+Curves of one variable are simulated, one column per knot. For the rest: in short windows an extra joint force is nearly
+constant, so a force that is some function of x has, in window w, the column function(x_w) * (constant force). The start
+states, the named effects and a constant force are projected out: what is left is dependence.
 """
 
 from dataclasses import dataclass
@@ -15,24 +15,22 @@ import numpy as np
 import scores
 import shooting
 import windows as cut
+from scan import WORTH
 
 LEVEL = 0.002  # false-alarm rate, shared between all joints and variables
-SHARE = 0.25  # of the squared residual that a leftover must explain
-KNOTS = 7
+SHARE, NOTABLE = 0.25, 0.05  # of the squared residual above the noise, and of the nominal model's, that a large leftover explains
+KNOTS = 7, 11  # of the curves that are tried
+QUIET = 1.15  # squared residual over that of noise alone, up to which nothing large can be left
 
 
 @dataclass
 class Leftover:
     joint: str
     variables: tuple  # e.g. ("velocity:elbow",)
-    knots: np.ndarray  # (k,) of the first variable
-    force: np.ndarray  # (k,) at the knots
+    candidate: object  # the `unknown` effect that models it
     p_value: float
     share: float  # of the squared residual explained
-    simulable: bool  # a curve of one variable
-
-    def candidate(self, world):
-        return world.curve(self.joint, self.variables[0], self.knots) if self.simulable else None
+    large: bool  # worth a finding of its own
 
 
 def hats(x, knots):
@@ -66,87 +64,104 @@ class Variables:
         self.span = float(np.median(span))
 
 
-def bases(model, v, joint):
-    """[(variables, basis (W, k), knots, simulable)] of the curves to try for a force in a joint."""
-    name = cut.joint_name(model, joint)
+def curves(world, problem, v, joint):
+    """Candidates of forces in a joint that are a curve of its position, its velocity or a control of its own."""
+    model, name = problem.model, cut.joint_name(problem.model, joint)
+    known = [cut.states(model, r) for r in {id(w.recording): w.recording for w in problem.windows}.values()]
+    seen = {f"position:{name}": np.concatenate([s[0][:, model.jnt_qposadr[joint]] for s in known]),
+            f"velocity:{name}": np.concatenate([s[1][:, model.jnt_dofadr[joint]] for s in known])}
+    seen |= {label: u for label, u in controls(model, v, joint)}
+    out = {world.curve(name, label, knots) for label, x in seen.items() for n in KNOTS if len(knots := spread_knots(x, n)) > 2}
+    return sorted(out, key=lambda c: (c.effect.variable, len(c.effect.knots)))
+
+
+def controls(model, v, joint):
+    """[(variable, (W,) window averages)] of the single controls that act on a joint."""
+    return [("control:" + (model.actuator(a).name or str(a)), v.control[:, model.actuator_ctrladr[a]])
+            for a in range(model.nactuator if model.nu else 0)
+            if model.actuator_trnid[a, 0] == joint and model.actuator_ctrlnum[a] == 1]
+
+
+def bases(world, v, joint):
+    """[(variables, basis (W, k), candidate)] of what else to try for a force in a joint, by windows."""
+    model, name, out = world.model, cut.joint_name(world.model, joint), []
     q, d = v.position[:, model.jnt_qposadr[joint]], v.velocity[:, model.jnt_dofadr[joint]]
-    out = []
-    for label, x in ((f"position:{name}", q), (f"velocity:{name}", d)):
-        knots = spread_knots(x, KNOTS)
-        if len(knots) > 2:
-            out.append(((label,), hats(x, knots), knots, True))
+    here, moving = f"position:{name}", f"velocity:{name}"
     knots = spread_knots(q, 6)
     if len(knots) > 2:
-        out.append(((f"position:{name}", f"velocity:{name}"), hats(q, knots) * np.sign(d)[:, None], knots, False))
-    for a in range(model.nactuator if model.nu else 0):
-        if model.actuator_trnid[a, 0] == joint and model.actuator_ctrlnum[a] == 1:
-            u, label = v.control[:, model.actuator_ctrladr[a]], "control:" + (model.actuator(a).name or str(a))
-            knots = spread_knots(u, 5)
-            if len(knots) > 2:
-                out.append(((label,), hats(u, knots), knots, True))
-                knots = np.linspace(v.time.min(), v.time.max(), 4)
-                out.append((("time", label), hats(v.time, knots) * u[:, None], knots, False))
+        out.append(((here, moving), hats(q, knots) * np.sign(d)[:, None], world.curve(name, here, knots, factor=moving)))
+    knots = np.linspace(v.time.min(), v.time.max(), 4)
+    for label, u in controls(model, v, joint):
+        out.append((("time", label), hats(v.time, knots) * u[:, None], world.curve(name, "time", knots, factor=label)))
+    knots = np.linspace(v.time.min(), v.time.max(), KNOTS[0])
+    out.append((("time",), hats(v.time, knots), world.curve(name, "time", knots)))
     length = np.ptp(v.time)
-    knots = np.linspace(v.time.min(), v.time.max(), KNOTS)
-    out.append((("time",), hats(v.time, knots), knots, True))
-    for frequency in np.arange(1.0, 0.7 * length / v.span, 0.5) / length:
-        phase = 2 * np.pi * frequency * v.time
-        out.append((("time",), np.stack([np.sin(phase), np.cos(phase)], 1), frequency, True))
+    for hertz in np.arange(1.0, 0.7 * length / v.span, 0.5) / length:
+        phase = 2 * np.pi * hertz * v.time
+        out.append((("time",), np.stack([np.cos(phase), np.sin(phase)], 1), world.curve(name, "time", (0.0, 0.25 / hertz), wave=True)))
     return out
 
 
-def leftover(search, problem, fit, least):
-    """The curve that explains most of what a fit leaves, or None.
+def leftover(search, problem, fit, bare):
+    """The dependence that explains most of what a fit leaves, if that is significant; else None.
 
-    problem, fit: short windows all over the data, and a fit to them; least: squared residual that a leftover must
-    explain at least, in the units of fit.chi2.
+    problem, fit: windows all over the data, and a fit to them; bare: the nominal model's squared residual.
     """
     world, model = search.world, search.model
+    free, chi2 = max(problem.rows - 2 * model.nv * len(problem.windows), 1), fit.chi2.sum()
     pushes = [c for c in world.candidates if c.effect.name == "spring_offset"]
-    if not pushes:
+    if not pushes or chi2 < QUIET * free:
         return None
-    settings, moves = shooting.perturbed(fit.hypothesis)
-    nominal = fit.hypothesis.settings
-    tried = []
+    nominal, own, v = fit.hypothesis.settings, shooting.perturbed(fit.hypothesis)[0], Variables(problem)
+    tried, where = [{**nominal, c: (nominal.get(c, c.nominal)[0] + c.parameters[0].step,)} for c in pushes], []
     for c in pushes:
-        before = nominal.get(c, c.nominal)
-        tried.append({**nominal, c: (before[0] + c.parameters[0].step,)})
-    slope = shooting.columns(problem, [fit], [settings + tried])[0]
-    scan = shooting.project(problem, fit, slope)
-    labels, chi2, own = scores.clusters(problem.windows), scan.chi2.sum(), len(settings)
-    v, out, tests = Variables(problem), [], 0
-    for i, c in enumerate(pushes):
-        column = own + i
+        mine = []
+        for curve in curves(world, problem, v, model.joint(c.place.name).id):
+            steps = c.parameters[0].step * np.eye(len(curve.effect.knots))
+            mine.append((curve, range(len(own) + len(tried), len(own) + len(tried) + len(steps))))
+            tried += [{**nominal, curve: tuple(row)} for row in steps]
+        where.append(mine)
+    scan = shooting.project(problem, fit, shooting.columns(problem, [fit], [own + tried])[0])
+    labels, out, tests = scores.clusters(problem.windows), [], 0
+    for i, (c, mine) in enumerate(zip(pushes, where)):
+        column = len(own) + i
         if scan.gram[:, column, column].sum() < shooting.UNSEEN:
             continue
-        joint = model.joint(c.place.name).id
-        options = bases(model, v, joint)
+        base = [*range(len(own)), column]
+        options = [((curve.effect.variable,), picked(scan, base, columns), curve) for curve, columns in mine]
+        options += [(variables, spread(scan, base, column, basis), curve)
+                    for variables, basis, curve in bases(world, v, model.joint(c.place.name).id)]
         tests += len(options)
-        for variables, basis, knots, simulable in options:
-            k = basis.shape[1]
-            pick = [*range(own), column]  # a constant force is no dependence: it is projected out with the named effects
-            b = len(pick)
-            gram = np.zeros((len(basis), b + k, b + k))
-            gram[:, :b, :b] = scan.gram[:, pick][:, :, pick]
-            gram[:, :b, b:] = scan.gram[:, pick, column][:, :, None] * basis[:, None, :]
-            gram[:, b:, :b] = np.swapaxes(gram[:, :b, b:], 1, 2)
-            gram[:, b:, b:] = scan.gram[:, column, column, None, None] * basis[:, :, None] * basis[:, None, :]
-            score = np.concatenate([scan.score[:, pick], scan.score[:, column, None] * basis], 1)
-            gram, score = search.freed(scores.summed(labels, gram), scores.summed(labels, score), b)
+        for variables, (gram, score), curve in options:
+            gram, score = search.freed(scores.summed(labels, gram), scores.summed(labels, score), len(base))
             seen = np.einsum("ckk->k", gram) > shooting.UNSEEN
-            if not seen.any():
-                continue
-            value, gain, p, held = scores.wald(gram[:, seen][:, :, seen], score[:, seen])
-            force = np.zeros(k)
-            force[seen] = value * c.parameters[0].step
-            out.append((gain - 2 * k * chi2 / max(problem.rows, 1), gain, p, held.sum(), c.place.name, variables, knots, force, simulable))
-    good = [o for o in out if o[2] * tests < LEVEL and o[3] > 0 and o[1] > max(SHARE * chi2, least)]
+            seen[0] &= bool(curve.effect.factor or curve.effect.wave)  # hats sum to a constant, which is projected out
+            if seen.any():
+                _, gain, p, held = scores.wald(gram[:, seen][:, :, seen], score[:, seen])
+                worth = gain - 2 * seen.sum() * chi2 / max(problem.rows, 1)
+                out.append((worth, gain, p, held.sum(), c.place.name, variables, curve))
+    good = [o for o in out if o[2] * tests < LEVEL and o[3] > 0]
     if not good:
         return None
     best = max(good, key=lambda o: o[0])
-    simple = [o for o in good if o[8] and o[0] > 0.85 * best[0]]
-    _, gain, p, _, joint, variables, knots, force, simulable = max(simple, key=lambda o: o[0]) if simple else best
-    if np.ndim(knots) == 0:  # a frequency: the sine at knots
-        frequency, knots = knots, np.arange(v.time.min(), v.time.max() + 0.1 / knots, 0.1 / knots)
-        force = np.stack([np.sin(2 * np.pi * frequency * knots), np.cos(2 * np.pi * frequency * knots)], 1) @ force
-    return Leftover(joint, variables, np.asarray(knots, float), force, min(1.0, p * tests), float(gain / chi2), simulable)
+    simple = [o for o in good if len(o[5]) == 1 and o[0] > 0.85 * best[0]]
+    _, gain, p, _, joint, variables, curve = max(simple, key=lambda o: o[0]) if simple else best
+    large = gain > max(SHARE * (chi2 - free), WORTH * chi2, NOTABLE * (bare - free))
+    return Leftover(joint, variables, curve, min(1.0, p * tests), float(gain / chi2), bool(large))
+
+
+def picked(scan, base, columns):
+    """Per window: gram and score of some columns of a scan behind those of base."""
+    pick = [*base, *columns]
+    return scan.gram[:, pick][:, :, pick], scan.score[:, pick]
+
+
+def spread(scan, base, column, basis):
+    """Per window: gram and score of basis (W, k) times one column, behind the columns of base."""
+    b, k = len(base), basis.shape[1]
+    gram = np.zeros((len(basis), b + k, b + k))
+    gram[:, :b, :b] = scan.gram[:, base][:, :, base]
+    gram[:, :b, b:] = scan.gram[:, base, column][:, :, None] * basis[:, None, :]
+    gram[:, b:, :b] = np.swapaxes(gram[:, :b, b:], 1, 2)
+    gram[:, b:, b:] = scan.gram[:, column, column, None, None] * basis[:, :, None] * basis[:, None, :]
+    return gram, np.concatenate([scan.score[:, base], scan.score[:, column, None] * basis], 1)

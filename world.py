@@ -92,10 +92,10 @@ class World:
                 return candidate
         raise KeyError(f'{effect} cannot sit at {place}')
 
-    def curve(self, joint, variable, knots):
+    def curve(self, joint, variable, knots, factor=None, wave=False):
         """Candidate `unknown`: a force in a joint as a curve of 'position:<joint>', 'velocity:<joint>',
-        'control:<actuator>' or 'time', linear between knots; its parameters are the forces at the knots."""
-        return joints.curve(self.model, joint, variable, knots)
+        'control:<actuator>' or 'time', linear between knots; its parameters are the forces at the knots. See joints.Unknown."""
+        return joints.curve(self.model, joint, variable, knots, factor, wave)
 
     def localised(self, candidate, when):
         """The same candidate acting only under a condition (see Candidate.when)."""

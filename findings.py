@@ -1,0 +1,178 @@
+"""What a fit says, in the words of the contract: findings with intervals and evidence, errors before, after and at the floor.
+
+    diagnosis = assemble(world, train, held_out, fit, search, possible, left, hint, event, ranking, position_noise, velocity_noise)
+    diagnosis.summary                    # diagnosis.json
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import evidence
+import scores
+import selection
+import shooting
+import windows as cut
+
+SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    summary: dict  # diagnosis.json
+    corrected_xml: str
+    world: object
+    settings: dict  # {Candidate: values}
+    ranking: list
+    traces: list
+    train: list  # Recordings
+    held_out: list
+
+
+def intervals(search, fit):
+    """{candidate: [(low, high), ...]}: 95 %, from the spread between clusters of windows, and the time step's error."""
+    if not fit.hypothesis.effects:
+        return {}
+    slope, moves = search.slopes(fit)
+    scan = shooting.project(search.problem, fit, slope, search.pieces)
+    gram, score = scores.summed(search.labels, scan.gram), scores.summed(search.labels, scan.score)
+    seen = np.diag(gram.sum(0)) > shooting.UNSEEN
+    covariance = scores.sandwich(gram[:, seen][:, :, seen], score[:, seen], np.zeros(seen.sum()))
+    half = np.full(len(moves), np.inf)
+    half[seen] = scores.t_quantile(max(len(gram) - seen.sum(), 1)) * np.sqrt(np.diag(covariance)) * np.abs(moves[seen])
+    # the integrator's own error: how far the values would move with half the time step
+    finer = search.problem.refined(fit)
+    shift = scores.solve_small(gram.sum(0)[np.ix_(seen, seen)], shooting.project(
+        search.problem, finer, slope, search.pieces).score.sum(0)[seen] - score.sum(0)[seen])
+    half[seen] = np.hypot(half[seen], shift * moves[seen])
+    out, at = {}, 0
+    for c, values in fit.hypothesis.effects:
+        out[c] = [(max(v - h, p.low), min(v + h, p.high)) for v, h, p in zip(values, half[at:], c.parameters)]
+        at += len(values)
+    return out
+
+
+def place_of(candidate):
+    return {"kind": candidate.place.kind, "name": candidate.place.name}
+
+
+def parameters_of(candidate, values, bounds=None):
+    out = []
+    for i, (p, v) in enumerate(zip(candidate.parameters, values)):
+        entry = {"name": p.name, "nominal": float(p.nominal), "value": float(v), "unit": p.unit}
+        if bounds:
+            entry["low"], entry["high"] = (float(b) for b in bounds[i])
+        out.append(entry)
+    return out
+
+
+def noise_by_channel(model, position_noise):
+    return {name: float(np.sqrt(np.mean(position_noise[dofs] ** 2))) for name, dofs in cut.channels(model).items()
+            if np.isfinite(position_noise[dofs]).all()}
+
+
+def assemble(world, train, held_out, fit, search, possible, left, hint, event, ranking, position_noise, velocity_noise):
+    settings, model = fit.hypothesis.settings, world.model
+    noise = evidence.reporting_noise(position_noise)
+    bounds = intervals(search, fit)
+    held = held_out or train
+    before, after = (evidence.prediction_error(world, s, held, noise)[0] for s in ({}, settings))
+    findings = []
+    xml, written = world.corrected_xml(settings)
+    for candidate, values in fit.hypothesis.effects:
+        without = evidence.prediction_error(world, fit.hypothesis.minus(candidate).settings, held, noise)[0]
+        curve = candidate.effect.name == "unknown"
+        findings.append({
+            "effect": candidate.effect.name, "place": place_of(candidate),
+            "parameters": parameters_of(candidate, values, bounds[candidate]),
+            "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
+                         "p_value": search.significance(fit, candidate)[0]},
+            "depends_on": list(left.variables) if curve else depends_on(model, candidate), "when": None, "written_as": written[candidate],
+            "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible.get(candidate, []))})
+    if event:
+        findings.append(event_finding(event, train))
+    findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
+    figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
+               "held_out": figure(world, settings, held, position_noise, velocity_noise)}
+    figures["held_out"]["horizon_s"] = cut.HORIZON
+    figures["held_out"]["curve"] = evidence.curve(world, {"before": {}, "after": settings}, held, noise)
+    floor = figures["held_out"]["floor"]
+    summary = {"format": 1, "verdict": "mismatch" if findings else "match",
+               "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,
+               "unexplained": {"fraction": float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1)),
+                               "place": {"kind": "joint", "name": hint.joint} if hint else None,
+                               "depends_on": list(hint.variables) if hint else []}}
+    return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
+                     train, held)
+
+
+def event_finding(event, train):
+    local = selection.Search(event.problem.world, event.problem, train)
+    candidate = event.candidate
+    named = lambda c, values, bounds=None: {"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, values, bounds)}
+    return {**named(candidate, event.values, intervals(local, event.fit)[candidate]),
+            "evidence": {"held_out_error_removed": 0.0, "p_value": event.p_value},
+            "depends_on": ["time"], "when": event.when, "written_as": "none",
+            "also_possible": [named(c, values) for c, values in event.others]}
+
+
+def figure(world, settings, recordings, position_noise, velocity_noise):
+    noise, channels, out = evidence.reporting_noise(position_noise), {}, {}
+    for name, s in (("before", {}), ("after", settings)):
+        out[name], per_channel = evidence.prediction_error(world, s, recordings, noise)
+        for channel, value in per_channel.items():
+            channels.setdefault(channel, {})[name] = value
+    out["floor"], per_channel = evidence.floor_error(world, settings, recordings, position_noise, velocity_noise)
+    for channel, value in per_channel.items():
+        channels[channel]["floor"] = value
+        channels[channel]["unit"] = unit_of(world.model, channel)
+    out["channels"] = channels
+    return out
+
+
+def unit_of(model, channel):
+    for j, kind, _, _ in cut.joint_slices(model):
+        name = "qpos:" + cut.joint_name(model, j)
+        if channel == name + ":pos" or (channel == name and kind.name == "mjJNT_SLIDE"):
+            return "m"
+    return "rad"
+
+
+# What the force of an effect varies with.
+VARIABLES = {"velocity": ("viscous_damping", "quadratic_damping", "coulomb_friction", "stribeck_friction", "back_emf"),
+             "position": ("stiffness", "nonlinear_stiffness", "joint_stop", "backlash", "cogging"),
+             "control": ("gain", "saturation", "dead_zone", "delay", "lag"),
+             "contact": ("contact_friction", "contact_stiffness", "contact_damping", "ground_height")}
+
+
+def depends_on(model, candidate):
+    variable = next((v for v, names in VARIABLES.items() if candidate.effect.name in names), None)
+    name = candidate.place.name
+    if variable == "velocity" and candidate.place.kind == "actuator":
+        name = cut.joint_name(model, model.actuator(name).trnid[0])
+    return [f"{variable}:{name}"] if variable else []
+
+
+def also_possible(world, train, noise, hypothesis, candidate, others, most=3):
+    """The alternatives that leave the reported error, on the data they were fitted to, within 5 % of the finding's."""
+    windows = evidence.consecutive(train, cut.HORIZON)
+    windows = windows[:: -(-len(windows) // 60)]
+    rms = lambda settings: cut.error(world.model, windows, evidence.predict(world, settings, windows)[0], noise)[0]
+    out, best = [], rms(hypothesis.settings) if others else 0.0
+    for _, other, values in others:
+        if len(out) < most and rms(hypothesis.minus(candidate).plus(other, values).settings) < (1 + SAME) * best:
+            out.append({"effect": other.effect.name, "place": place_of(other), "parameters": parameters_of(other, values)})
+    return out
+
+
+def ranking_rows(trials, fit):
+    """Best option of every candidate in the first scan: share of the squared residual it removes, and its p-value."""
+    rows, seen = [], set()
+    for t in trials:
+        c = t.option.candidate
+        if c in seen:
+            continue
+        seen.add(c)
+        rows.append({"effect": c.effect.name, "place": place_of(c), "error_removed": float(t.gain / t.chi2), "p_value": t.p_value,
+                     "chosen": c in fit.hypothesis.candidates})
+    return rows[:40]
