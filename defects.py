@@ -13,7 +13,7 @@ import numpy as np
 from readers import WIDTHS
 from recordings import grouped
 
-AWAY = 10  # a spike is so many times as large as nearly all changes from row to row
+AWAY, PACE = 8, 3  # a spike is so many times as far off as rows usually are, and as the motion before and after goes in a row
 LONGEST = 3  # rows of a spike; what lasts longer may be real
 CATCH_UP = 2  # the change after repeated values, in the one that follows it: above, they were stale
 COUNTS = 3  # of the encoder: changes up to these are its resolution
@@ -44,26 +44,29 @@ def _channels(model):
 
 
 def _spikes(values):
-    """(T,) rows in which values (T, k) leave the motion, at most LONGEST at a time, and come back to it."""
+    """(T,) rows, at most LONGEST at a time, in which values (T, k) are far from the line between the rows around them."""
     found = np.zeros(len(values), bool)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1))
     if len(rows) < 20:
         return found
     x = values[rows]
     change = np.abs(np.diff(x, axis=0)).max(axis=1)
-    if not change.any():
-        return found
-    usual = np.quantile(change[change > 0], 0.95)
-    k = 1
-    while k < len(x) - 1:
-        if change[k - 1] > AWAY * usual and abs(change[k - 1] - 2 * np.pi) > 0.1:  # else an angle wraps
-            for end in range(k + 1, min(k + LONGEST, len(x) - 1) + 1):
-                if np.abs(x[end] - x[k - 1]).max() <= (end - k + 1) * usual < change[end - 1]:
-                    found[rows[k:end]] = True
-                    k = end
-                    break
-        k += 1
+    usual = np.quantile(_off_line(x, 1), 0.9)
+    for n in range(1, LONGEST + 1):
+        off = _off_line(x, n)[1:-1]  # off[i]: rows i + 2 to i + 1 + n, in motion at change[i] before and change[i + n + 2] after
+        pace = np.max([change[:len(off)], change[n + 2:], np.abs(x[n + 2:-1] - x[1:-n - 2]).max(axis=1) / (n + 1)], axis=0)
+        jump = change[1:1 + len(off)]
+        spike = (off > AWAY * usual) & (off > PACE * pace) & (np.abs(jump - 2 * np.pi) > 0.1)  # else an angle wraps
+        for k in range(n):
+            found[rows[np.flatnonzero(spike) + 2 + k]] = True
     return found
+
+
+def _off_line(x, n):
+    """(T - n - 1,) how far at least n rows of x (T, k) are from the straight line between the row before and the one after."""
+    first, last = x[:-n - 1], x[n + 1:]
+    inside = [np.abs(x[k:k + len(first)] - first - (last - first) * k / (n + 1)).max(axis=1) for k in range(1, n + 1)]
+    return np.min(inside, axis=0)
 
 
 def _repeats(values):
