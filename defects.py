@@ -70,7 +70,8 @@ def _off_line(x, n):
 
 
 def _repeats(values):
-    """(T,) rows in which values (T, k) are the row before's to the last digit, though the next new one is far from it."""
+    """(T,) rows in which values (T, k) are the row before's to the last digit, though the next new one, or the one before,
+    is far from it."""
     found = np.zeros(len(values), bool)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1))
     if len(rows) < 20:
@@ -90,4 +91,7 @@ def _repeats(values):
         following = change[last + 1] if last + 1 < len(change) else np.inf
         if last < len(change) and change[last] > COUNTS * count and change[last] > CATCH_UP * following:
             found[rows[first + 1:last + 1]] = True
+        if first > 1 and change[first - 2] and change[first - 1] > max(PACE * change[first - 2], COUNTS * count):
+            # it even jumped there, to zero, say
+            found[rows[first:last + 1]] = True
     return found

@@ -74,6 +74,17 @@ def test_spikes_and_dropouts(length):
     assert notes == [f"run.csv: qpos:elbow jumps away and back in {share} of its rows, which count as not measured"]
 
 
+def test_a_dropout_to_zero_amid_fast_motion():
+    """The zeros are too near the line between the values before and after to be a spike."""
+    time = 0.01 * np.arange(400)
+    qpos = np.stack([6 * np.sin(4 * time), np.cos(time)], axis=1) + 2e-4 * np.random.default_rng(0).normal(size=(400, 2))
+    at = 75
+    assert 1.0 < qpos[at - 1, 0] < 1.2 and 0 < qpos[at + 3, 0] < 0.2  # going on by 0.24 in a row
+    qpos[at:at + 3, 0] = 0
+    rows, _ = missing(replace(recorded(), qpos=qpos, qvel=np.full((400, 2), np.nan)))
+    assert np.flatnonzero(rows[:, 0]).tolist() == [at, at + 1, at + 2] and not rows[:, 1].any()
+
+
 def test_a_wrapped_angle_is_no_spike():
     wrapped = recorded()
     qpos = wrapped.qpos.copy()
