@@ -81,17 +81,16 @@ def _repeats(values):
     if same.all() or not same.any():
         return found
     count = change[~same].min()
-    if same.sum() <= 3 * np.count_nonzero(change[~same] < 1.5 * count):  # repeats by chance, of a coarse and noisy sensor
-        return found
+    chance = same.sum() <= 3 * (np.count_nonzero(change[~same] < 1.5 * count) - 1)  # a coarse and noisy sensor repeats, too
+    usual = np.median(change[~same])
     begin = np.flatnonzero(same & ~np.append(False, same[:-1]))  # change[k] is between rows k and k + 1
     for first in begin:
         last = first
         while last < len(same) and same[last]:
             last += 1
         following = change[last + 1] if last + 1 < len(change) else np.inf
-        if last < len(change) and change[last] > COUNTS * count and change[last] > CATCH_UP * following:
+        if last < len(change) and not chance and change[last] > max(COUNTS * count, CATCH_UP * following):
             found[rows[first + 1:last + 1]] = True
-        if first > 1 and change[first - 2] and change[first - 1] > max(PACE * change[first - 2], COUNTS * count):
-            # it even jumped there, to zero, say
-            found[rows[first:last + 1]] = True
+        if first > 1 and last > first + 1 and change[first - 2] and change[first - 1] > PACE * max(change[first - 2], usual):
+            found[rows[first:last + 1]] = True  # it even jumped there, to zero, say
     return found
