@@ -81,6 +81,7 @@ class Effect:
     kinds = ()         # kinds of place; one instance for each, with the attribute `kind`
     constants = False  # edit() changes something that mj_setConst derives constants from
     timed = False      # differs from a simpler effect only under a condition
+    amplitudes = 0     # of an effect with probes: how many of its first parameters it acts in proportion to
     simplicity = 1     # 0 for the first things to think of, up to 3
     related = ()       # names of effects at the same joint in whose wrong value this one may hide
 

@@ -29,6 +29,7 @@ LEAST_ROWS, LEAST_WINDOWS, FEW_ROWS = 8, 20, 100
 LEFTOVER_SPANS = 0.2, 0.1  # s
 STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up to which the curve does without them
 WORSE = 0.02  # of the reported error: more is no accident
+MUCH = 4.0  # squared residual, over the noise's, with which a search does not end empty-handed
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
@@ -71,7 +72,10 @@ def identify(world, train, held_out, progress=None):
 
 
 def searched(data, say):
-    """Rounds of search with longer and longer windows: (Search, Fit, first ranking, last span)."""
+    """Rounds of search with longer and longer windows: (Search, Fit, first ranking, last span).
+
+    Where the first finds nothing though much is left, windows were too long for that: motion far off is soon not linear.
+    """
     world, train = data[:2]
     hypothesis, ranking, span = shooting.Hypothesis(), [], 0.0
     for i in range(ROUNDS):
@@ -79,15 +83,17 @@ def searched(data, say):
         longer = span_for(*data, hypothesis, at_least=span)
         if i and longer < 1.5 * span:
             break
-        span = longer
-        problem = problem_of(*data, span, SEARCH_STEPS)
-        say(0.1 + 0.15 * i, f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
-        search = selection.Search(world, problem, train)
-        fit = shooting.fit_starts(problem, hypothesis)
-        if hypothesis.effects:
-            [fit] = shooting.solve(problem, [hypothesis], fit)
-            fit = search.drop(fit, ())
-        fit = search.run(fit)
+        for span in (longer, longer / 3):
+            problem = problem_of(*data, span, SEARCH_STEPS)
+            say(0.1 + 0.15 * i, f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
+            search = selection.Search(world, problem, train)
+            fit = shooting.fit_starts(problem, hypothesis)
+            if hypothesis.effects:
+                [fit] = shooting.solve(problem, [hypothesis], fit)
+                fit = search.drop(fit, ())
+            fit = search.run(fit)
+            if i or fit.hypothesis.effects or fit.chi2.sum() < MUCH * problem.rows:
+                break
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     return search, fit, ranking, span

@@ -142,7 +142,7 @@ class StribeckFriction(JointEffect):
     |F| = coulomb + (static − coulomb) exp(−(v/velocity)²): here as frictionloss `static` and
     a force that gives back what it is too much once moving; in MJCF with LuGre bristles.
     """
-    name, simplicity, related = 'stribeck_friction', 3, DISSIPATION
+    name, simplicity, related, amplitudes = 'stribeck_friction', 3, DISSIPATION, 2
 
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, 'N·m', 'N')
@@ -212,7 +212,7 @@ class SpringOffset(JointEffect):
 @catalogue
 class Cogging(JointEffect):
     """Force amplitude·sin(poles·q + phase), as of a motor's magnets."""
-    name, simplicity = 'cogging', 3
+    name, simplicity, amplitudes = 'cogging', 3, 1
 
     def fits(self, model, i):
         return super().fits(model, i) and self.driven(model, i)

@@ -194,7 +194,11 @@ class Scan:
         nominal = np.array([p.nominal for p in parameters])
         low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
         if not option.linear:
-            return option.directions[0] if value[0] > 0.05 else None
+            probe, n = np.array(option.directions[0]), option.candidate.effect.amplitudes
+            if n:  # in proportion to these it is linear; a ripple may be turned round, friction may not
+                start = np.r_[np.clip(value[0] * probe[:n], low[:n], high[:n]), probe[n:]]
+                return tuple(start) if start[0] else None
+            return tuple(probe) if value[0] > 0.05 else None
         move = sum(v * (np.array(option.directions[c - where[0]]) - nominal) for c, v in zip(columns, value))
         start = np.clip(nominal + move, low, high)
         if np.all(np.abs(start - nominal) < 1e-3 * np.abs(move)):

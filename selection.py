@@ -21,11 +21,11 @@ HOPE = 0.05  # p-value of the linear look, of one candidate, up to which a refit
 class Search(Scan):
     def run(self, fit, most=6):
         """Additions, drops and swaps from the nominal fit: a Fit."""
-        late = False
+        late, refused = False, set()
         for _ in range(most):
             trials, gram, score, chi2 = self.trials(fit, late)
             self.ranking = self.ranking or trials
-            proposals = self.proposals(fit, trials, gram, score, chi2)
+            proposals = [p for p in self.proposals(fit, trials, gram, score, chi2) if frozenset(c for c, _ in p) not in refused]
             hypotheses = [fit.hypothesis for _ in proposals]
             for i, proposal in enumerate(proposals):
                 for candidate, start in proposal:
@@ -35,6 +35,7 @@ class Search(Scan):
             if chosen is None and late:
                 break
             late = chosen is None
+            refused = refused | {frozenset(c for c, _ in p) for p in proposals} if late else set()
             fit = fit if late else self.drop(*chosen)
         return fit
 
@@ -209,9 +210,10 @@ class Search(Scan):
                 singles.append((chi2, option, columns, start))
         singles.sort(key=lambda s: s[0])
         now = scan.chi2.sum()
-        hypotheses, seen = [], set()
+        hypotheses, seen, akin = [], set(), set(self.world.related(candidate))
         for chi2, option, _, start in singles:
-            if option.candidate not in seen and len(seen) < 2 * most and alone - chi2 > 0.5 * (alone - now):
+            stands = len(seen) < 2 * most and alone - chi2 > 0.5 * (alone - now)
+            if option.candidate not in seen and (stands or option.candidate in akin):
                 hypotheses.append(without.plus(option.candidate, start))
                 seen.add(option.candidate)
         # a first look at full size, where what is alike in a small step may differ, and the other way round
