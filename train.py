@@ -29,10 +29,11 @@ from trpo import PRESETS, TRPO, Transitions, rollouts
 from world import quiet
 
 # settings that suit each task, where the command line does not say
+BY_TASK = ("pretrain_steps", "reference_steps", "grounding_steps", "at_steps", "policy_steps", "at_std")
 DEFAULTS = {
-    "InvertedPendulum": {"pretrain_steps": 150_000, "grounding_steps": 10, "at_steps": 100_000, "policy_steps": 100_000, "at_std": 0.05},
-    "Hopper": {"pretrain_steps": 1_000_000, "grounding_steps": 10, "at_steps": 200_000, "policy_steps": 250_000, "at_std": 0.01},
-    "HalfCheetah": {"pretrain_steps": 1_000_000, "grounding_steps": 20, "at_steps": 200_000, "policy_steps": 250_000, "at_std": 0.01},
+    "InvertedPendulum": dict(zip(BY_TASK, (80_000, 200_000, 5, 50_000, 20_000, 0.05))),
+    "Hopper": dict(zip(BY_TASK, (1_000_000, 1_000_000, 10, 200_000, 250_000, 0.01))),
+    "HalfCheetah": dict(zip(BY_TASK, (1_000_000, 1_000_000, 20, 200_000, 250_000, 0.01))),
 }
 
 
@@ -54,6 +55,9 @@ class Settings:
     real: str = option(None, "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)")
     policy: str = option("deep", "hidden layers of the target policy: deep 2x64, shallow 1x4", choices=["deep", "shallow"])
     pretrain_steps: int = option(None, "steps in the raw sim before the first grounding step (default: by task)")
+    reference_steps: int = option(
+        None, "steps on real, from scratch, of the policy that is the reference line (default: by task, or --pretrain-steps if given)"
+    )
     grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
     real_trajectories: int = option(
         None, "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)"
@@ -82,6 +86,8 @@ class Settings:
         task = task_of(self.env)
         trajectories = 1 if self.algo == "physics" else 50
         defaults = {**DEFAULTS[self.env.split("-")[0]], "real": task.real, "real_trajectories": trajectories}
+        if self.pretrain_steps is not None:
+            defaults["reference_steps"] = self.pretrain_steps
         done = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
         for name, least in COUNTS.items():
             if getattr(done, name) < least:
@@ -98,7 +104,7 @@ class Settings:
 
 
 COUNTS = {
-    "seed": 0, "pretrain_steps": 0, "grounding_steps": 0, "real_trajectories": 1, "at_steps": 1, "policy_steps": 0,
+    "seed": 0, "pretrain_steps": 0, "reference_steps": 0, "grounding_steps": 0, "real_trajectories": 1, "at_steps": 1, "policy_steps": 0,
     "eval_episodes": 1, "num_envs": 1, "threads": 0,
 }  # fmt: skip
 
@@ -214,17 +220,17 @@ def start(s, run, sim, real, bar):
         bar.lap()
         return learner, grounding, tau_real
 
-    learner.load(pretrained(s, "real" if s.algo == "real" else "sim", world, bar))
+    learner.load(pretrained(s, "real" if s.algo == "real" else "sim", world, s.pretrain_steps, bar))
     reference(s, run, learner, real, bar)
     record(s, run, 0, learner, grounding, real, tau_real, {}, bar)
     return learner, grounding, tau_real
 
 
 def reference(s, run, learner, real, bar):
-    """The green line: what a policy trained on real from scratch, with the sim policy's budget, returns there."""
+    """The green line: what a policy trained from scratch on real, for --reference-steps, returns there."""
     if s.algo != "real":
         learner = new_learner(s)
-        learner.load(pretrained(s, "real", real, bar))
+        learner.load(pretrained(s, "real", real, s.reference_steps, bar))
     seed = seed_for(s.seed, 0, "evaluate")
     run.set_lines(**{"trained on real": float(rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)[0].mean())})
 
@@ -238,16 +244,16 @@ def new_learner(s):
     return TRPO(policy, Value(nobs), PRESETS[s.env.split("-")[0]])
 
 
-def pretrained(s, world, env, bar):
+def pretrained(s, world, env, steps, bar):
     """TRPO from scratch in a world, "sim" or "real": the learner's state. Runs that name one --pretrained folder share it."""
     preset = PRESETS[s.env.split("-")[0]]
-    decides = [s.env, s.real if world == "real" else "", s.policy, s.seed, s.pretrain_steps, s.num_envs, preset, versions()]
+    decides = [s.env, s.real if world == "real" else "", s.policy, s.seed, steps, s.num_envs, preset, versions()]
     key = hashlib.sha256(repr(decides).encode()).hexdigest()[:16]
     folder = Path(s.pretrained) if s.pretrained else bar.run.folder
     path = folder / f"{s.env}-{world}-{key}.pt"
     learner = new_learner(s)
     if path.exists():
-        bar.skip(s.pretrain_steps, counts=world == bar.world)
+        bar.skip(steps, counts=world == bar.world)
         try:
             learner.load(load_checkpoint(path))
         except (ValueError, KeyError, TypeError, RuntimeError):
@@ -256,7 +262,7 @@ def pretrained(s, world, env, bar):
     name = "pretrain" if world == bar.world else "reference"
     bar.run.train = [row for row in bar.run.train if row["phase"] != name]  # what a cut-off attempt left
     log = bar.phase(0, name)
-    learner.learn(env, s.pretrain_steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=log)
+    learner.learn(env, steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=log)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -276,7 +282,7 @@ class Bar:
         self.run, self.seen, self.drawn, self.clock = run, 0, time.monotonic(), time.monotonic()
         self.world = "real" if s.algo == "real" else "sim"
         at_steps = s.at_steps * (s.algo == "rgat")
-        total = s.pretrain_steps * (1 if s.algo == "real" else 2) + s.grounding_steps * (s.policy_steps + at_steps)
+        total = s.pretrain_steps + s.reference_steps * (s.algo != "real") + s.grounding_steps * (s.policy_steps + at_steps)
         self.tqdm = tqdm(total=total, unit="step", unit_scale=True, disable=None, dynamic_ncols=True, smoothing=0.05)
 
     def phase(self, step, name):

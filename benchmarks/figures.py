@@ -1,6 +1,6 @@
 """The README's figures and tables of the grounding runs, drawn from the committed CSVs.
 
-    python benchmarks/figures.py        # results/grounding.png, and the tables on the terminal as Markdown
+    python benchmarks/figures.py        # results/grounding.png, transitions.png, and the tables on the terminal as Markdown
 """
 
 import csv
@@ -27,21 +27,30 @@ def curves(rows):
     return table
 
 
+def panels(count, across=3):
+    """A figure and its axes, one for each of `count` panels."""
+    rows = -(-count // across)
+    figure = Figure(figsize=(4.6 * min(count, across), 3.7 * rows), layout="constrained")
+    axes = figure.subplots(rows, min(count, across), squeeze=False).flat
+    for unused in list(axes)[count:]:
+        unused.set_axis_off()
+    return figure, axes
+
+
 def draw_grounding(rows, best):
     """One panel per task: every seed thin, the mean thick with its standard error, both reference lines."""
-    table = {key: algos for key, algos in curves(rows).items() if key[2] == "default"}
-    figure = Figure(figsize=(5.2 * max(1, len(table)), 4), layout="constrained")
-    for axes, ((env, policy, _), algos) in zip(np.atleast_1d(figure.subplots(1, max(1, len(table)))), sorted(table.items())):
+    table = {key: algos for key, algos in sorted(curves(rows).items()) if key[2] == "default"}
+    figure, all_axes = panels(len(table))
+    for axes, ((env, policy, _), algos) in zip(all_axes, table.items()):
         for algo, seeds in algos.items():
-            color = COLORS[algo]
             for returns in seeds.values():
-                axes.plot(returns, color=color, lw=0.6, alpha=0.35)
+                axes.plot(returns, color=COLORS[algo], lw=0.6, alpha=0.3)
             length = min(map(len, seeds.values()))
             values = np.array([returns[:length] for returns in seeds.values()])
             mean, se = values.mean(0), values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.zeros(length)
-            axes.plot(mean, color=color, lw=2, marker="o", ms=4, label=f"{algo}, {len(values)} seed{'s' * (len(values) > 1)}")
-            axes.fill_between(range(length), mean - se, mean + se, color=color, alpha=0.2, lw=0)
-        lines = [row for row in best if row["env"] == env and row["policy"] == policy and row["tag"] == "default"]
+            axes.plot(mean, color=COLORS[algo], lw=2, marker="o", ms=3, label=f"{algo}, {seeds_of(values)}")
+            axes.fill_between(range(length), mean - se, mean + se, color=COLORS[algo], alpha=0.2, lw=0)
+        lines = [row for row in best if (row["env"], row["policy"], row["tag"]) == (env, policy, "default")]
         for column, color in (("trained_on_real", COLORS["real"]), ("before_grounding", COLORS["sim"])):
             values = [float(v) for v in {row["seed"]: row[column] for row in lines if row[column]}.values()]
             if values:
@@ -52,17 +61,57 @@ def draw_grounding(rows, best):
     figure.savefig(RESULTS / "grounding.png", dpi=110)
 
 
+def seeds_of(values):
+    return f"{len(values)} seed{'s' * (len(values) > 1)}"
+
+
+def draw_transitions(rows, best):
+    """Return on real against the real transitions that it took: diagnosis beside RGAT, every seed a line."""
+    mine = [r for r in rows if r["tag"] == "default" and r["policy"] == "deep" and r["algo"] in ("physics", "rgat") and int(r["grounding_step"])]
+    tasks = [env for env in sorted({r["env"] for r in mine}) if any(r["env"] == env and r["algo"] == "physics" for r in mine)]
+    if not tasks:
+        return
+    figure, all_axes = panels(len(tasks))
+    for axes, env in zip(all_axes, tasks):
+        for algo in ("rgat", "physics"):
+            seeds = sorted({r["seed"] for r in mine if (r["env"], r["algo"]) == (env, algo)})
+            for i, seed in enumerate(seeds):
+                run = [r for r in mine if (r["env"], r["algo"], r["seed"]) == (env, algo, seed)]
+                x, y = ([float(r[k]) for r in run] for k in ("real_transitions", "real_return_deterministic"))
+                label = None if i else f"{algo}, {seeds_of(seeds)}"
+                axes.semilogx(x, y, color=COLORS[algo], lw=1, marker="o", ms=4, alpha=0.7, label=label)
+        lines = {r["seed"]: float(r["trained_on_real"]) for r in best if r["env"] == env and r["policy"] == "deep"}
+        axes.axhline(np.mean(list(lines.values())), color=COLORS["real"], lw=1.2, ls="--", label="trained on real, mean")
+        axes.set(title=env, xlabel="real transitions used", ylabel="return on real, deterministic", ylim=(0, None))
+        axes.legend(fontsize=7)
+    figure.savefig(RESULTS / "transitions.png", dpi=110)
+
+
 def table(rows, best):
     """Markdown: the last step's mean, and the best step re-evaluated on fresh episodes, per task and method."""
-    print("| task | policy | method | settings | seeds | last step, mean (each) | best step on fresh episodes, median (each) | `real` line, mean |\n|---|---|---|---|---|---|---|---|")
+    titles = ["task", "policy", "method", "seeds", "before, median", "last step, mean (each)", "best step on fresh episodes, median (each)", "`real` line, median"]
+    print("\n| " + " | ".join(titles) + " |\n" + "|---" * len(titles) + "|")
+    each = lambda values: f"({', '.join(f'{v:.0f}' for v in values)})"
     for (env, policy, tag), algos in sorted(curves(rows).items()):
         for algo, seeds in algos.items():
             last = [returns[-1] for returns in seeds.values()]
             mine = [row for row in best if (row["env"], row["policy"], row["tag"], row["algo"]) == (env, policy, tag, algo)]
-            fresh = [float(row["real_return_deterministic"]) for row in mine]
-            real = np.mean([float(row["trained_on_real"]) for row in mine])
-            each = lambda values: ", ".join(f"{v:.0f}" for v in values)
-            print(f"| {env} | {policy} | {algo} | {tag} | {len(last)} | {np.mean(last):.0f} ({each(last)}) | {np.median(fresh):.0f} ({each(fresh)}) | {real:.0f} |")
+            fresh, real, before = ([float(r[k]) for r in mine] for k in ("real_return_deterministic", "trained_on_real", "before_grounding"))
+            cells = [env, policy, algo if tag == "default" else f"{algo} ({tag})", len(last), f"{np.median(before):.0f}"]
+            cells += [f"{np.mean(last):.0f} {each(last)}", f"{np.median(fresh):.0f} {each(fresh)}", f"{np.median(real):.0f}"]
+            print("| " + " | ".join(map(str, cells)) + " |")
+
+
+def trpo_table(rows):
+    """Markdown: TRPO here and sb3-contrib's, median over seeds of the deterministic return."""
+    groups = defaultdict(list)
+    for row in rows:
+        groups[row["env"], row["implementation"]].append(row)
+    print("\n| environment | implementation | steps | deterministic, median (each) | stochastic, median | CPU seconds |\n|---|---|---|---|---|---|")
+    for (env, implementation), mine in sorted(groups.items()):
+        returns, noisy, seconds = ([float(r[k]) for r in mine] for k in ("return_deterministic", "return_stochastic", "seconds"))
+        every = ", ".join(f"{v:.0f}" for v in returns)
+        print(f"| {env} | {implementation} | {int(mine[0]['steps']):,} | {np.median(returns):.0f} ({every}) | {np.median(noisy):.0f} | {np.median(seconds):.0f} |")
 
 
 def settings_table(rows):
@@ -78,7 +127,9 @@ def settings_table(rows):
 
 if __name__ == "__main__":
     settings_table(read("transformer_settings.csv"))
+    trpo_table(read("trpo.csv"))
     rows, best = read("grounding.csv"), read("best.csv")
     if rows:
         draw_grounding(rows, best)
+        draw_transitions(rows, best)
         table(rows, best)
