@@ -14,6 +14,7 @@ Row t is the state at time[t] and the control held from time[t] to time[t+1]. Na
 import os
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 
 from readers import WIDTHS, RecordingError, columns_of, read
@@ -140,6 +141,7 @@ def check(recordings, model):
         _check_time(recording, model, warn)
         _check_values(recording, model, warn)
         _check_rates(recording, model, warn)
+        _check_overlap(recording, model, warn)
     moving = [recording for recording in recordings if _moves(recording)]
     everything = recordings[0].name + _more(recordings)
     rows, seconds = sum(len(r.time) for r in moving), sum(r.time[-1] - r.time[0] for r in moving)
@@ -265,6 +267,10 @@ def _check_values(recording, model, warn):
             unit = "degrees" if kind == "qpos" and hinge else "another unit than the model's"
             raise RecordingError(f"{where}: reaches {largest:g} where the model's range is {span[0]:g} to {span[1]:g}; "
                                  f"if it is in {unit}, convert it")
+        beyond = np.abs(values - np.mean(span)) > 0.75 * np.ptp(span)  # stops are soft
+        if kind == "qpos" and limited and beyond.mean() > 0.03:
+            warn(recording, f"{column} is far outside the joint's range in the model, {span[0]:g} to {span[1]:g}, in {{}} of its "
+                 "rows; check that range and where the sensor's zero is", beyond.mean())
         if kind == "ctrl" and limited and (low < span[0] - 1e-3 * np.ptp(span) or high > span[1] + 1e-3 * np.ptp(span)):
             warn(recording, f"{column} leaves the model's ctrlrange {span[0]:g} to {span[1]:g}; MuJoCo clips it there")
         kept = {edge: np.count_nonzero((values[1:] == edge) & (values[:-1] == edge)) / rows for edge in (low, high)}
@@ -274,6 +280,25 @@ def _check_values(recording, model, warn):
             if share > 0.03 and not switched and (at_range or (edge if kind == "qpos" else low == -high)):
                 why = "saturated at ctrlrange" if at_range else "saturated" if kind == "ctrl" else "clipped, or at a stop"
                 warn(recording, f"{column} stays at its extreme {edge:g} in {{}} of the rows: {why}", share)
+
+
+def _check_overlap(recording, model, warn):
+    """Geoms that the recorded positions put deep into each other: another origin, or another size."""
+    rows = np.unique(np.linspace(0, len(recording.time) - 1, 40).astype(int))
+    data, deep = mujoco.MjData(model), {}
+    for row in rows:
+        data.qpos[:] = np.where(np.isnan(recording.qpos[row]), model.qpos0, recording.qpos[row])
+        mujoco.mj_fwdPosition(model, data)
+        for pair in {tuple(contact.geom) for contact in data.contact if contact.geom.min() >= 0}:
+            depth = -min(contact.dist for contact in data.contact if tuple(contact.geom) == pair)
+            deep.setdefault(pair, []).append(depth)
+    for (a, b), depths in deep.items():
+        depth = np.quantile(depths, 0.1)
+        size = min((r for r in model.geom_rbound[[a, b]] if r > 0), default=0.1)  # a plane has none
+        if len(depths) > 0.2 * len(rows) and depth > max(0.02, 0.2 * size):
+            names = " and ".join(model.geom(g).name or f"geom {g}" for g in (a, b))
+            warn(recording, f"{names} overlap by {depth:.2g} m and more in {{}} of the rows; check the origin of the positions "
+                 "and the model's sizes", len(depths) / len(rows))
 
 
 def _check_rates(recording, model, warn):

@@ -2,6 +2,7 @@
 
 The page is one file: drawings are inline SVG, nothing is fetched, and it reads on a phone, in light and in dark.
 """
+import fnmatch
 import html
 import json
 import math
@@ -53,6 +54,9 @@ def write(diagnosis, out):
     try:
         os.makedirs(out, exist_ok=True)
         write_together({os.path.join(out, name): text for name, text in files.items()})
+        for name in fnmatch.filter(os.listdir(out), "unknown_*.csv"):  # of an earlier diagnosis
+            if name not in files:
+                os.remove(os.path.join(out, name))
     except (OSError, WriteError) as error:
         if made and os.path.isdir(out) and not os.listdir(out):
             os.rmdir(out)

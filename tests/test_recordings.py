@@ -216,6 +216,20 @@ def test_warnings(model, good):
     assert "nothing moves" in " | ".join(check([recording(good), recording(still, "still.csv")], model))
 
 
+def test_positions_that_the_model_cannot_have(model, good):
+    far = good.copy()
+    far[:, 2] += 5
+    assert "qpos:elbow is far outside the joint's range in the model, -2.9 to 2.9, in" in " | ".join(check([recording(far[:, :7])], model))
+    cube = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><body pos="0 0 .1">
+        <freejoint name="cube"/><geom name="box" type="box" size=".1 .1 .1"/></body></worldbody></mujoco>""")
+    t = 0.01 * np.arange(100)
+    qpos = np.stack([t, 0 * t, 0.1 + 0 * t, 1 + 0 * t, 0 * t, 0 * t, 0 * t], axis=1)
+    slides = Recording("slide.csv", t, qpos, np.full((100, 6), np.nan), np.zeros((100, 0)))
+    assert "overlap" not in " | ".join(check([slides], cube))
+    qpos[:, 2] -= 0.1  # measured from the corner instead of the centre
+    assert "floor and box overlap by 0.1 m and more in 100 % of the rows" in " | ".join(check([slides], cube))
+
+
 def test_same_warning_for_many_files_is_one_line(model, good):
     many = []
     for k in range(5):

@@ -150,8 +150,9 @@ def test_three_files_and_the_unknown_curve(diagnosis, tmp_path):
     mask = os.umask(0)
     os.umask(mask)
     assert stat.S_IMODE(os.stat(out / "report.html").st_mode) == 0o666 & ~mask
+    (out / "unknown_7.csv").write_text("of an earlier diagnosis")
     report.write(diagnosis, out)  # again, over the old ones
-    assert len(os.listdir(out)) == 4
+    assert len(os.listdir(out)) == 4 and "unknown_7.csv" not in os.listdir(out)
 
 
 @pytest.mark.parametrize("fails", ["fsync", "replace"])
