@@ -236,7 +236,8 @@ def _check_values(recording, model, warn):
         where = f"{recording.name}: column {column!r}"
         missing = np.isnan(values)
         if missing.any():
-            what = "is not measured" if missing.all() else "has nan in {} of its rows"
+            what = ("is not measured; it is guessed, and where it moves the others that will look like missing physics"
+                    if missing.all() else "has nan in {} of its rows")
             warn(recording, f"{column} {what}", missing.mean())
             values = values[~missing]
         if len(values) < 2:
