@@ -188,16 +188,17 @@ def _check_copies(recordings):
 
 
 def _moves(recording):
-    """Whether any position leaves the band of its own noise (8 sigma, from second differences) for good."""
-    for values in recording.qpos.T:
-        values = values[~np.isnan(values)]
-        if len(values) < 5:
-            continue
-        noise = np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6))
-        smooth = np.convolve(values, np.ones(5) / 5, "valid")
-        if np.ptp(smooth) > 5 * noise + 1e-9 * (1 + np.abs(values).max()):
-            return True
-    return False
+    """Whether any position leaves the band of its own noise."""
+    return any(_leaves_noise(values[~np.isnan(values)]) for values in recording.qpos.T)
+
+
+def _leaves_noise(values):
+    """Whether (T,) measured values leave the band of their own noise (five sigma, from second differences) for good."""
+    if len(values) < 5:
+        return False
+    noise = np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6))
+    smooth = np.convolve(values, np.ones(5) / 5, "valid")
+    return np.ptp(smooth) > 5 * noise + 1e-9 * (1 + np.abs(values).max())
 
 
 def _check_time(recording, model, warn):
@@ -258,6 +259,9 @@ def _check_values(recording, model, warn):
                 raise RecordingError(f"{where}: moves at {speed:.3g} {'rad/s' if hinge else 'm/s'} most of the time; "
                                      f"is it in {'degrees' if hinge else 'mm'}? convert it to {'rad' if hinge else 'm'}, "
                                      "and time to s")
+            if not _leaves_noise(values):
+                warn(recording, f"{column} does not move beyond the sensor's noise; nothing can be said about what only its motion "
+                     "would show")
             if hinge and abs(jumps[row] - 2 * np.pi) < 0.5 and jumps[row] > 20 * np.median(jumps) + 1e-6:
                 raise RecordingError(f"{where}: jumps by {jumps[row]:.3g} rad after data row "
                                      f"{np.flatnonzero(~missing)[row] + 1}, a wrapped angle; unwrap it (numpy.unwrap)")

@@ -74,6 +74,13 @@ def _readings(recording, model, states, half):
     for j in single:
         yield Reading(f"column 'qpos:{names[j]}' seems to have the wrong sign; turn it round", [v[j]], SWAP_GAIN,
                       _scaled(model, states, {j: -1.0}))
+    for j in single:
+        if model.jnt_type[j] == HINGE:
+            for degrees in (180, 90, -90):
+                turned = states[0].copy()
+                turned[:, q[j]] += np.deg2rad(degrees)
+                yield Reading(f"column 'qpos:{names[j]}' seems to count from another zero than the model; add {degrees} degrees "
+                              f"({np.deg2rad(degrees):.4f}), or set the joint's ref", [v[j]], SWAP_GAIN, (turned, *states[1:]))
     controls, signs = [c for c in columns_of(model) if c.startswith("ctrl:")], 1.0 - 2.0 * np.eye(model.nu)
     moments = _moments(model)
     driven = [np.flatnonzero(moment) for moment in moments]

@@ -48,6 +48,7 @@ def estimate(parameter):
     decimals = max(0, (half < 2.95 * 10.0 ** math.floor(math.log10(half))) - math.floor(math.log10(half)))  # 0.12 but 0.4
     if decimals > 6 or half > 1e6:
         return f"{number(value)} ({number(low)} to {number(high)}){unit}"
+    value = round(value, decimals) or 0.0  # not -0
     most = max(0, 3 - math.floor(math.log10(abs(value)))) if value else decimals
     if decimals > most:  # four digits of a value are enough, however narrow its interval
         return f"{value:.{most}f} ± {number(half, 1)}{unit}"
@@ -82,7 +83,8 @@ def change(parameter):
     nominal = parameter["nominal"]
     if nominal is None or math.isinf(nominal):
         return estimate(parameter)
-    share = f" ({100 * (parameter['value'] / nominal - 1):+.0f} %)" if nominal else ""
+    ratio = parameter["value"] / nominal if nominal else 1.0
+    share = "" if not nominal else f" ({ratio:.0f} times)" if ratio >= 10 else f" ({100 * (ratio - 1):+.0f} %)"
     return f"{estimate(parameter)} instead of {number(nominal)}{share}"
 
 
