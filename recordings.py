@@ -260,8 +260,8 @@ def _check_values(recording, model, warn):
                                      f"is it in {'degrees' if hinge else 'mm'}? convert it to {'rad' if hinge else 'm'}, "
                                      "and time to s")
             if not _leaves_noise(values):
-                warn(recording, f"{column} does not move beyond the sensor's noise; nothing can be said about what only its motion "
-                     "would show")
+                warn(recording, f"{column} does not move beyond the sensor's noise; nothing can be said about what only its "
+                     "motion would show")
             if hinge and abs(jumps[row] - 2 * np.pi) < 0.5 and jumps[row] > 20 * np.median(jumps) + 1e-6:
                 raise RecordingError(f"{where}: jumps by {jumps[row]:.3g} rad after data row "
                                      f"{np.flatnonzero(~missing)[row] + 1}, a wrapped angle; unwrap it (numpy.unwrap)")

@@ -3,6 +3,7 @@
     for name, case in cases().items():
         argv = case.write(folder)        # the command line; must give exit status 2 and one line that holds case.says
 """
+import gzip
 import io
 import pickle
 import zipfile
@@ -146,11 +147,19 @@ def cases():
     csv("no header", text(good).split(b"\n", 1)[1], "header")
     csv("semicolons", text(good, separator=";"), "semicolons")
     csv("tabs", text(good, separator="\t"), "tabs")
+    csv("spaces", text(good, separator=" "), "separated by spaces")
+    csv("only comments", b"# a recording\n# of nothing\n", "no header")
+    csv("gzip", gzip.compress(text(good)), "gunzip")
     csv("decimal commas", text(good).replace(b".", b","), "cells")
     csv("unbalanced quote", b'"time,qpos:shoulder\n0,1\n', "header")
     csv("an NPZ called CSV, cut off", archive(**whole(good))[:300], "NPZ")
     csv("cut off in a row", text(good)[:-20], "cells")
     found["a folder"] = Case({}, "folder", ["--model", "{dir}/arm.xml", "--recordings", "{dir}", "--out", "{dir}/report"])
+    found["a folder of recordings"] = Case({"run.csv": text(good)}, "name the files in it", found["a folder"].argv)
+    found["a copy under another name"] = Case({"run.csv": text(good), "copy.csv": text(good)}, "same rows",
+                                              [*found["a folder"].argv[:3], "{dir}/run.csv", "{dir}/copy.csv", "--out", "{dir}/report"])
+    found["a fitted file held out as a copy"] = Case(found["a copy under another name"].files, "same rows", [
+        *found["a folder"].argv[:3], "{dir}/run.csv", "--held-out", "{dir}/copy.csv", "--out", "{dir}/report"])
     found["no such file"] = Case({}, "no such file")
     found["unmatched pattern"] = Case({}, "no such file", ["--model", "{dir}/arm.xml", "--recordings", "{dir}/*.csv", "--out", "{dir}/report"])
     found["a device"] = Case({}, "regular file", ["--model", "{dir}/arm.xml", "--recordings", "/dev/null", "--out", "{dir}/report"])
