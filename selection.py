@@ -15,7 +15,7 @@ import shooting
 from scan import WORTH, Scan
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
-HOPE = 0.05  # p-value of the linear look, of one candidate, up to which a refit is tried: far away it is only a hint
+HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
 
 
 class Search(Scan):
@@ -39,21 +39,23 @@ class Search(Scan):
             fit = fit if late else self.drop(*chosen)
         return fit
 
-    def proposals(self, fit, trials, gram, score, chi2, looks=12, singles=4, doubles=2):
+    def proposals(self, fit, trials, gram, score, chi2, looks=12, singles=5, doubles=2):
         """What to refit: [[(candidate, start)], ..., [(candidate, start), (candidate, start)], ...].
 
-        Single effects by what they leave at full size, where what is alike in a small step may differ, and no two of
-        them alike there too; pairs by the linear estimate, where it promises much more than any single effect.
+        Single effects by what they leave at full size, where what is alike in a small step may differ, and by the linear
+        estimate in turn, no two of them alike; pairs by the linear estimate, where it promises much more than any single effect.
         """
-        worth = self.worth(fit)
-        hopeful = [t for t in trials if t.start and t.p_value < HOPE and t.held > 0 and t.gain > 0.3 * worth * chi2][:looks]
+        level, worth = ALPHA / self.places, self.worth(fit)
+        fair = [t for t in trials if t.start and t.p_value < HOPE and t.held > 0 and t.gain > 0.3 * worth * chi2]
+        promising = {t.option.candidate for t in fair if t.p_value < 10 * level}
+        hopeful = [t for t in fair if t.option.candidate in promising][:looks]
         tried = [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful]
         begun = shooting.evaluate(self.scouting, tried, fit.subset(self.scouts))
         left = [f.chi2.sum() for f in shooting.follow(self.scouting, begun, iterations=2)]
-        chosen = []
-        for i in sorted(range(len(left)), key=left.__getitem__):
+        chosen, by_size = [], sorted(range(len(left)), key=left.__getitem__)
+        for i in (i for both in zip(by_size, range(len(left))) for i in both):  # the linear estimate moves the others along
             rivals = [j for j in chosen if self.alike(hopeful[i], hopeful[j], gram) and left[i] > 0.9 * left[j]]
-            if len(chosen) < singles and not rivals:
+            if len(chosen) < singles and i not in chosen and not rivals:
                 chosen.append(i)
         out = [[(hopeful[i].option.candidate, hopeful[i].start)] for i in chosen]
         best = max((t.gain for t in trials if t.start), default=0.0)
