@@ -118,6 +118,10 @@ class Effect:
                 for k, p in enumerate(parameters) for d in (p.step, -p.step) if p.low <= p.nominal + d <= p.high]
         return np.array(rows)
 
+    def canonical(self, values):
+        """The same effect in its usual numbers, where several sets of values mean the same."""
+        return values
+
     def build(self, spec, model, i):
         """Add to spec (of the nominal model) what edit() sizes."""
 

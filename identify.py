@@ -55,6 +55,7 @@ def identify(world, train, held_out, progress=None):
     hypothesis = fit.hypothesis
     say(0.75, "testing for anything left")
     hypothesis, left, hint = anything_left(data, search, hypothesis)
+    hypothesis = shooting.Hypothesis(tuple((c, c.effect.canonical(values)) for c, values in hypothesis.effects))
     say(0.8, "intervals")
     final = selection.Search(world, problem_of(*data, span, FINAL_STEPS), train)
     fit = shooting.fit_starts(final.problem, hypothesis)

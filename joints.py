@@ -233,6 +233,10 @@ class Cogging(JointEffect):
             poles = np.arange(2.0, 23.0, 1.5) / travel
         return np.array([(0.05 * self.scale(model, i), n, phase) for n in poles for phase in (0.0, np.pi / 2)])
 
+    def canonical(self, values):
+        amplitude, poles, phase = values
+        return abs(amplitude), poles, (phase + np.pi * (amplitude < 0)) % (2 * np.pi)
+
     def _motor(self, model, i):
         return f'cogging:{model.joint(i).name}'
 
