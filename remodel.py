@@ -10,7 +10,7 @@ import numpy as np
 from diagnose import ModelError, diagnose
 from envs import BatchEnv, EnvError, model_path
 from recordings import Recording, RecordingError
-from rgat import Grounding, GroundingSettings, identity
+from rgat import Grounding, GroundingSettings, identity, one_step_error
 
 
 class Physics(Grounding):
@@ -24,13 +24,17 @@ class Physics(Grounding):
         self.nominal, self.xml = sim, ""
 
     def fit(self, tau_real, policy, seed):
-        """Line 3: from the raw simulator and all that was recorded so far, the simulator with the missing physics."""
+        """Line 3: from the raw simulator and all that was recorded so far, the simulator with the missing physics.
+
+        The last one stays where it predicts the recorded transitions better than the new one.
+        """
         path = model_path(self.nominal.env_id)
         try:
             diagnosis = diagnose(path, recordings_of(self.nominal, tau_real))
         except (RecordingError, ModelError) as error:
             raise EnvError(f"no diagnosis from {len(tau_real)} real transitions: {error}") from None
-        self.xml = diagnosis.corrected_xml
+        error = lambda xml: one_step_error(self._simulator(xml), identity, tau_real)[0]
+        self.xml = min((diagnosis.corrected_xml, self.xml), key=error)
         return {}
 
     def update(self, policy, steps, seed, on_update=None):
@@ -39,10 +43,14 @@ class Physics(Grounding):
         return {}
 
     def _rebuild(self):
-        if self.xml:
-            model = mujoco.MjModel.from_xml_string(self.xml)
-            self.sim = BatchEnv(self.nominal.env_id, self.nominal.num_envs, model=model, nthread=self.nominal.batch.nthread)
-        self.transformer = identity
+        self.sim, self.transformer = self._simulator(self.xml), identity
+
+    def _simulator(self, xml):
+        """The task in the world of an MJCF, or in the raw simulator's if there is none yet."""
+        if not xml:
+            return self.nominal
+        model = mujoco.MjModel.from_xml_string(xml)
+        return BatchEnv(self.nominal.env_id, self.nominal.num_envs, model=model, nthread=self.nominal.batch.nthread)
 
     def state(self):
         return {"corrected_xml": self.xml}

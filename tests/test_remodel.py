@@ -1,15 +1,17 @@
 """Grounding by diagnosis: what becomes a recording, and that the missing physics ends up in the simulator."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
+import pytest
 import torch
 
-from envs import BatchEnv, EnvError, parse_perturbation
+from envs import BatchEnv, EnvError, model_path, parse_perturbation
 from models import GaussianPolicy
 from remodel import Physics, recordings_of
 from rgat import identity, one_step_error
 from trpo import Transitions, rollouts
-import pytest
 
 torch.set_num_threads(1)
 
@@ -59,6 +61,25 @@ def test_the_heavy_pole_is_found_and_put_into_the_simulator():
     again = Physics(sim)  # what a checkpoint holds rebuilds the same simulator
     again.load(grounding.state())
     assert one_step_error(again.sim, identity, held_out) == one_step_error(grounding.sim, identity, held_out)
+
+
+def test_a_diagnosis_that_predicts_worse_than_the_last_is_not_taken(monkeypatch):
+    sim = BatchEnv("InvertedPendulum-v4", 4, nthread=1)
+    real = BatchEnv("InvertedPendulum-v4", 4, parse_perturbation("pole:mass=20"), nthread=1)
+    tau, grounding = transitions(real, 4), Physics(sim)
+    for mass, kept in ((12, 12), (100, 12), (20, 20)):
+        monkeypatch.setattr("remodel.diagnose", lambda path, recordings: SimpleNamespace(corrected_xml=with_pole(mass)))
+        grounding.fit(tau, None, 0)
+        assert mujoco.MjModel.from_xml_string(grounding.xml).body("pole").mass[0] == pytest.approx(kept)
+
+
+def with_pole(mass):
+    spec = mujoco.MjSpec.from_file(str(model_path("InvertedPendulum-v4")))
+    nominal = spec.compile().body("pole")
+    pole = spec.body("pole")
+    pole.explicitinertial, pole.mass, pole.ipos = True, mass, nominal.ipos
+    pole.iquat, pole.inertia = nominal.iquat, nominal.inertia * mass / nominal.mass[0]
+    return spec.to_xml()
 
 
 def test_too_little_to_diagnose_is_said_in_a_line():
