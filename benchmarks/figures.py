@@ -31,8 +31,8 @@ def panels(count, across=3):
     """A figure and its axes, one for each of `count` panels."""
     rows = -(-count // across)
     figure = Figure(figsize=(4.6 * min(count, across), 3.7 * rows), layout="constrained")
-    axes = figure.subplots(rows, min(count, across), squeeze=False).flat
-    for unused in list(axes)[count:]:
+    axes = list(figure.subplots(rows, min(count, across), squeeze=False).flat)
+    for unused in axes[count:]:
         unused.set_axis_off()
     return figure, axes
 
