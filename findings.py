@@ -76,7 +76,11 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     noise = evidence.reporting_noise(position_noise)
     bounds = intervals(search, fit)
     held = held_out or train
-    before, after = (evidence.prediction_error(world, s, held, noise)[0] for s in ({}, settings))
+    figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
+               "held_out": figure(world, settings, held, position_noise, velocity_noise)}
+    figures["held_out"]["horizon_s"] = cut.HORIZON
+    figures["held_out"]["curve"] = evidence.curve(world, {"before": {}, "after": settings}, held, noise)
+    before, after, floor = (figures["held_out"][k] for k in ("before", "after", "floor"))
     findings = []
     xml, written = world.corrected_xml(settings)
     for candidate, values in fit.hypothesis.effects:
@@ -92,11 +96,6 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     if event:
         findings.append(event_finding(event, train))
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
-    figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
-               "held_out": figure(world, settings, held, position_noise, velocity_noise)}
-    figures["held_out"]["horizon_s"] = cut.HORIZON
-    figures["held_out"]["curve"] = evidence.curve(world, {"before": {}, "after": settings}, held, noise)
-    floor = figures["held_out"]["floor"]
     summary = {"format": 1, "verdict": "mismatch" if findings else "match",
                "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,
                "unexplained": {"fraction": float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1)),

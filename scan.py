@@ -106,22 +106,28 @@ class Scan:
         """Least fall of the squared residual: more where no hypothesis comes near the noise, and small gains mean little."""
         return WORTH if fit.chi2.sum() < 4 * self.problem.rows else WORTH_MISFIT
 
+    @staticmethod
+    def stacked(problem, fit, settings, options, known):
+        """Columns of settings, then of options, at a fit: (W, m, K). known {option: columns} spares simulating, and grows."""
+        new = [o for o in options if o not in known]
+        tried = [fit.hypothesis.plus(o.candidate, d).settings for o in new for d in o.directions]
+        slope, at = shooting.columns(problem, [fit], [settings + tried])[0], len(settings)
+        for o in new:
+            known[o] = slope[..., at:at + len(o.directions)]
+            at += len(o.directions)
+        return np.concatenate([slope[..., :len(settings)], *(known[o] for o in options)], -1)
+
     def reduced(self, fit, options, problem):
         """Cluster sums (C, k, k), (C, k) of columns with start states and the fit's own parameters projected out; chi2.
 
         Columns over all windows are kept: those of the same fit are not simulated again.
         """
-        base, moves = shooting.perturbed(fit.hypothesis)
-        kept = self.looked if problem is self.problem else {}
-        new = [o for o in options if o not in kept]
-        settings = [fit.hypothesis.plus(o.candidate, d).settings for o in new for d in o.directions]
-        slope, at = shooting.columns(problem, [fit], [base + settings])[0], len(base)
-        for o in new:
-            kept[o] = fit, slope[..., at:at + len(o.directions)]
-            at += len(o.directions)
-        slope = np.concatenate([slope[..., :len(base)], *(kept[o][1] for o in options)], -1)
-        scan = shooting.project(problem, fit, slope, self.pieces)
-        labels = {id(self.problem): self.labels, id(self.small): self.few_labels, id(self.scouting): self.scout_labels}[id(problem)]
+        base, whole = shooting.perturbed(fit.hypothesis)[0], problem is self.problem
+        known = {o: columns for o, (_, columns) in self.looked.items()} if whole else {}
+        slope = self.stacked(problem, fit, base, options, known)
+        if whole:
+            self.looked |= {o: (fit, known[o]) for o in options if o not in self.looked}
+        scan, labels = shooting.project(problem, fit, slope, self.pieces), self.labels if whole else self.scout_labels
         gram, score = scores.summed(labels, scan.gram), scores.summed(labels, scan.score)
         gram, score = self.freed(gram, score, len(base))
         return gram, score, float(scan.chi2.sum())

@@ -180,16 +180,9 @@ class Search(Scan):
         tenth = np.isfinite(nominal).all()
         if tenth:
             less = without.plus(candidate, nominal + 0.9 * (np.array(values) - nominal)).settings
-        at_hand = {o: self.looked[o][1][self.few] for o in options if o in self.looked and self.looked[o][0] is fit}
-        tried = [small.hypothesis.plus(o.candidate, d).settings for o in options if o not in at_hand for d in o.directions]
-        slope = shooting.columns(self.small, [small], [own + [less] + tried])[0]
+        known = {o: columns[self.few] for o, (at, columns) in self.looked.items() if at is fit}
+        slope = self.stacked(self.small, small, own + [less], options, known)
         slope[..., len(own)] *= 10.0 if tenth else 1.0
-        at = len(own) + 1
-        for o in options:
-            if o not in at_hand:
-                at_hand[o] = slope[..., at:at + len(o.directions)]
-                at += len(o.directions)
-        slope = np.concatenate([slope[..., :len(own) + 1], *(at_hand[o] for o in options)], -1)
         scan = shooting.project(self.small, small, slope)
         gram, k = scan.gram.sum(0), len(own)
         score = scan.score.sum(0) - gram[:, k]  # of the residual without the effect
