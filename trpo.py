@@ -12,6 +12,7 @@ to first order: conjugate gradient on the Fisher matrix gives the direction, the
 line search the largest step that really keeps both promises.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -91,17 +92,22 @@ def conjugate_gradient(product, b, steps, tolerance=1e-10):
 def fisher_product(policy, obs, damping):
     """v -> (F + damping I) v, F the Fisher matrix of the policy at its present parameters, over obs (N, nobs).
 
-    F is the Hessian of KL(pi || pi_theta) at theta = pi: the KL and its gradient are 0 there, its Hessian is
-    not. One differentiation of gradient . v gives the product without ever forming F.
+    For a Gaussian, F is the mean over obs of J' diag(1/sigma^2) J, J the Jacobian of the action's mean, and 2 for
+    each log sigma: what the Hessian of KL(pi || pi_theta) at theta = pi comes to. J' u is linear in u, so
+    differentiating it by u gives J v, and F is never formed.
     """
-    parameters = list(policy.parameters())
-    mean, log_std = policy(obs)
-    kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)
-    gradient = torch.cat([g.reshape(-1) for g in torch.autograd.grad(kl, parameters, create_graph=True)])
+    weights, log_std = list(policy.net.parameters()), policy.log_std.detach()
+    sizes = [len(log_std), *(w.numel() for w in weights)]
+    mean = policy.mean(obs)
+    u = torch.zeros_like(mean, requires_grad=True)
+    Jt_u = torch.autograd.grad(mean, weights, u, create_graph=True)
+    metric = torch.exp(-2 * log_std) / len(obs)
 
     def product(v):
-        hessian_v = torch.autograd.grad(gradient @ v, parameters, retain_graph=True)
-        return torch.cat([g.reshape(-1) for g in hessian_v]) + damping * v
+        v_log_std, *v_weights = v.split(sizes)
+        (Jv,) = torch.autograd.grad(Jt_u, u, [x.view_as(w) for x, w in zip(v_weights, weights)], retain_graph=True)
+        Fv = torch.autograd.grad(mean, weights, metric * Jv, retain_graph=True)
+        return torch.cat([2 * v_log_std, *(x.reshape(-1) for x in Fv)]) + damping * v
 
     return product
 
@@ -119,19 +125,15 @@ def policy_update(policy, obs, action, advantage, config):
     informative = torch.isfinite(spread) and spread > 1e-9 * advantage.abs().max()
     advantage = ((advantage - advantage.mean()) / spread if informative else torch.zeros_like(advantage)).to(obs.dtype)
 
-    with torch.no_grad():
-        old_mean, old_log_std = policy(obs)
-        old_log_std = old_log_std.clone()
-        old_log_prob = gaussian_log_prob(old_mean, old_log_std, action)
+    mean, log_std = policy(obs)
+    log_prob = gaussian_log_prob(mean, log_std, action)
+    old_mean, old_log_std, old_log_prob = mean.detach(), log_std.detach().clone(), log_prob.detach()
 
-    def surrogate():
-        mean, log_std = policy(obs)
-        ratio = torch.exp(gaussian_log_prob(mean, log_std, action) - old_log_prob)
-        kl = gaussian_kl(old_mean, old_log_std, mean, log_std)
-        return (ratio * advantage).mean() + config.entropy * gaussian_entropy(log_std), kl
+    def surrogate(log_prob, log_std):
+        return (torch.exp(log_prob - old_log_prob) * advantage).mean() + config.entropy * gaussian_entropy(log_std)
 
     stats = {"kl": 0.0, "surrogate_gain": 0.0, "step_size": 0.0, "line_search": "accepted"}
-    old_surrogate, _ = surrogate()
+    old_surrogate = surrogate(log_prob, log_std)
     gradient = parameters_to_vector(torch.autograd.grad(old_surrogate, list(policy.parameters())))
     old_surrogate = old_surrogate.detach()
     old = parameters_to_vector(policy.parameters()).detach().clone()
@@ -147,7 +149,9 @@ def policy_update(policy, obs, action, advantage, config):
         with torch.no_grad():
             for k in range(config.backtracks):
                 vector_to_parameters(old + config.backtrack**k * full_step, policy.parameters())
-                new_surrogate, kl = surrogate()
+                mean, log_std = policy(obs)
+                new_surrogate = surrogate(gaussian_log_prob(mean, log_std, action), log_std)
+                kl = gaussian_kl(old_mean, old_log_std, mean, log_std)
                 if torch.isfinite(new_surrogate) and kl <= config.max_kl and new_surrogate > old_surrogate:
                     gain = float(new_surrogate - old_surrogate)
                     stats.update(kl=float(kl), surrogate_gain=gain, step_size=config.backtrack**k, line_search="accepted")
@@ -159,16 +163,24 @@ def policy_update(policy, obs, action, advantage, config):
 
 
 def value_update(value, optimizer, obs, returns, config, generator):
-    """Fit V to returns (N,) by minibatch Adam on the squared error, in the value's own scale."""
+    """A function that fits V to returns (N,) by minibatch Adam on the squared error, in the value's own scale.
+
+    Everything random or shared is settled before it is handed out: it may run beside the policy's update and the
+    next rollout, and the numbers do not depend on when.
+    """
     value.returns.update(returns[:, None])
     inputs, target = value.normalizer(obs), (returns[:, None] - value.returns.mean) / value.returns.std
-    for _ in range(config.value_epochs):
-        order = torch.randperm(len(obs), generator=generator)
-        for x, y in zip(inputs[order].split(config.value_batch), target[order].split(config.value_batch)):
-            loss = ((value.net(x) - y) ** 2).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
+    orders = [torch.randperm(len(obs), generator=generator) for _ in range(config.value_epochs)]
+
+    def fit():
+        for order in orders:
+            for x, y in zip(inputs[order].split(config.value_batch), target[order].split(config.value_batch)):
+                loss = ((value.net(x) - y) ** 2).mean()
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+
+    return fit
 
 
 def explained_variance(prediction, target):
@@ -182,7 +194,7 @@ def explained_variance(prediction, target):
 
 @contextmanager
 def torch_threads(n):
-    """Within a rollout torch takes one thread: its own would fight the simulator's pool for the cores."""
+    """Meanwhile torch takes n threads: in a rollout its own would fight the simulator's pool for the cores."""
     before = torch.get_num_threads()
     torch.set_num_threads(n)
     try:
@@ -224,16 +236,19 @@ class TRPO:
         adapt = self.config.normalize_obs and not freeze_normalizer
         returns_of = EpisodeReturns(env.num_envs)
         done_steps = 0
-        while done_steps < steps:
-            with torch_threads(1):
+        with torch_threads(1), ThreadPoolExecutor(1) as beside:
+            value_fit = beside.submit(lambda: None)  # nothing to wait for yet
+            while done_steps < steps:
                 batch, obs = self.collect(env, obs, horizon)
-            done_steps += horizon * env.num_envs
-            stats = self.update(batch, update_policy)
-            if adapt:
-                for network in (self.policy, self.value):
-                    network.normalizer.update(torch.from_numpy(batch["obs"].reshape(-1, batch["obs"].shape[-1])))
-            if on_update:
-                on_update({"steps": done_steps, "return": returns_of.mean(batch), **stats})
+                done_steps += horizon * env.num_envs
+                value_fit.result()
+                stats, value_fit = self.update(batch, update_policy, beside)
+                if adapt:
+                    for network in (self.policy, self.value):
+                        network.normalizer.update(torch.from_numpy(batch["obs"].reshape(-1, batch["obs"].shape[-1])))
+                if on_update:
+                    on_update({"steps": done_steps, "return": returns_of.mean(batch), **stats})
+            value_fit.result()
 
     def collect(self, env, obs, horizon):
         """Act for `horizon` steps. Returns arrays (T, N, ...) by name, and the observation to go on from."""
@@ -260,20 +275,23 @@ class TRPO:
         config = self.config
         return gae(batch["reward"], value, next_value, batch["terminated"], batch["done"], config.gamma, config.lam), value
 
-    def update(self, batch, update_policy=True):
-        """One update of policy and value from collect()'s arrays; returns the statistics to log."""
+    def update(self, batch, update_policy, beside):
+        """Update the policy from collect()'s arrays and start fitting the value in `beside`, an executor.
+
+        Returns the statistics to log, and the future that ends with the fit.
+        """
         advantage, value = self.advantages(batch)
         returns = advantage + value
         obs, action = (torch.from_numpy(batch[k]).flatten(0, 1) for k in ("obs", "action"))
+        targets = torch.from_numpy(returns.reshape(-1)).float()
+        value_fit = beside.submit(value_update(self.value, self.optimizer, obs, targets, self.config, self.generator))
         stats = {}
         if update_policy:
             stats = policy_update(self.policy, obs, action, torch.from_numpy(advantage.reshape(-1)), self.config)
         stats["explained_variance"] = explained_variance(value, returns)
         stats["std"] = float(self.policy.log_std.detach().exp().mean())
         stats["reward"] = float(batch["reward"].mean())
-        targets = torch.from_numpy(returns.reshape(-1)).float()
-        value_update(self.value, self.optimizer, obs, targets, self.config, self.generator)
-        return stats
+        return stats, value_fit
 
 
 class EpisodeReturns:
