@@ -16,21 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import train  # noqa: E402
-
-
-def append(path, rows):
-    """Add dicts to a CSV whose columns are the first row's."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        if new:
-            writer.writeheader()
-        writer.writerows(rows)
-
-
-def done(path, key):
-    """Whether a CSV holds a row with these values."""
-    return path.exists() and any(all(row[k] == str(v) for k, v in key.items()) for row in csv.DictReader(path.open(newline="")))
+from benchmarks.rows import append, finished  # noqa: E402
 
 
 def main():
@@ -46,7 +32,7 @@ def main():
     for seed in args.seeds:
         for algo in args.algos:
             key = {"env": args.env, "policy": args.policy, "algo": algo, "tag": args.tag, "seed": seed}
-            if done(args.results / "best.csv", key):
+            if finished(args.results / "best.csv", key):
                 continue
             folder = args.runs / "-".join(str(v) for v in key.values())
             options = ["--env", args.env, "--algo", algo, "--policy", args.policy, "--seed", str(seed), "--threads", "1"]

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import train  # noqa: E402
-from benchmarks.grounding import append, done  # noqa: E402
+from benchmarks.rows import append, finished  # noqa: E402
 from envs import BatchEnv, parse_perturbation  # noqa: E402
 from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, one_step_error  # noqa: E402
 from trpo import rollouts  # noqa: E402
@@ -56,7 +56,7 @@ def main():
         s = train.Settings(env=args.env, seed=seed, threads=1, pretrained=str(ROOT / "runs" / "pretrained")).completed()
         todo = [dict(zip(COLUMNS, values)) for values in VARIANTS]
         todo = [{**v, "at_std": v["at_std"] or s.at_std} if v["method"] == "rgat" else v for v in todo]
-        todo = [v for v in todo if not done(CSV, {"env": s.env, "seed": seed, **v})]
+        todo = [v for v in todo if not finished(CSV, {"env": s.env, "seed": seed, **v})]
         if not todo:
             continue
         sim, real = BatchEnv(s.env, s.num_envs, nthread=1), BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=1)

@@ -9,7 +9,6 @@ Each policy is judged by 20 episodes acting by its mean and 20 acting at random 
 """
 
 import argparse
-import csv
 import sys
 import time
 from pathlib import Path
@@ -20,11 +19,11 @@ import torch
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from benchmarks.rows import append, finished  # noqa: E402
 from envs import TASKS, BatchEnv, parse_perturbation  # noqa: E402
 from train import Settings, new_learner, seed_for  # noqa: E402
 from trpo import rollouts  # noqa: E402
 
-COLUMNS = ["implementation", "env", "seed", "steps", "return_deterministic", "return_stochastic", "seconds"]
 STEPS = {"InvertedPendulum": 200_000, "Hopper": 1_000_000, "HalfCheetah": 1_000_000}
 ORIGINALS = [f"{name}-v4" for name in TASKS]
 PERTURBED = [f"{name}-v4 {task.real}" for name, task in TASKS.items()]
@@ -59,22 +58,6 @@ def train_sb3(name, seed, steps, num_envs, threads):
 IMPLEMENTATIONS = {"ours": train_ours, "sb3-contrib": train_sb3}
 
 
-def finished(path):
-    """The (implementation, env, seed, steps) that a results file holds."""
-    rows = csv.DictReader(path.open(newline="")) if path.exists() else []
-    return {(r["implementation"], r["env"], int(r["seed"]), int(r["steps"])) for r in rows}
-
-
-def append(path, row):
-    """Add one row in a single write, so that parallel runs do not mix theirs."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", newline="") as file:
-        if file.tell() == 0:
-            file.write(",".join(COLUMNS) + "\n")
-            file.flush()
-        csv.DictWriter(file, COLUMNS, lineterminator="\n").writerow(row)
-
-
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--implementations", nargs="+", choices=list(IMPLEMENTATIONS), default=list(IMPLEMENTATIONS))
@@ -92,15 +75,16 @@ def main(argv=None):
         for name in args.envs or ORIGINALS + PERTURBED * (implementation == "ours"):
             steps = args.steps or STEPS[name.partition("-")[0]]
             for seed in args.seeds or range(SEEDS[implementation]):
-                if (implementation, name, seed, steps) in finished(args.results):
+                key = {"implementation": implementation, "env": name, "seed": seed, "steps": steps}
+                if finished(args.results, key):
                     continue
                 start = time.process_time()
                 policy = IMPLEMENTATIONS[implementation](name, seed, steps, args.num_envs, args.threads)
                 seconds = time.process_time() - start
                 env = make_env(name, args.episodes, args.threads)
                 judge = lambda deterministic: float(np.mean(rollouts(policy, env, args.episodes, 10_000 + seed, deterministic)[0]))
-                row = dict(zip(COLUMNS, (implementation, name, seed, steps, round(judge(True), 1), round(judge(False), 1), round(seconds, 1))))
-                append(args.results, row)
+                row = {**key, "return_deterministic": round(judge(True), 1), "return_stochastic": round(judge(False), 1), "seconds": round(seconds, 1)}
+                append(args.results, [row])
                 print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
 
 
