@@ -57,17 +57,31 @@ def crossed(search, fit, windows, position_noise):
     return np.sqrt(square)
 
 
-def floor_error(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, seed=0):
-    """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}).
+def floor_error(world, settings, recordings, position_noise, velocity_noise):
+    """The error that a perfect simulator would have, as (all channels in noises, {channel: SI})."""
+    gap = floor_gaps(world, settings, recordings, position_noise, velocity_noise)[:, 1:]
+    known = np.isfinite(gap)
+    square = np.where(known, gap**2, 0.0)
+    per_channel = {name: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
+                   for name, dofs in cut.channels(world.model).items() if known[..., dofs].any()}
+    noise = reporting_noise(position_noise)
+    return float(np.sqrt((square / noise**2).sum() / max(known.sum(), 1))), per_channel
 
-    The corrected model from fitted start states stands for the truth, from one row before each window on. It is measured
-    anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities by differences.
+
+def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, most=100, seed=0):
+    """What a perfect simulator would miss in at most `most` windows: (W, T, nv), NaN where nothing was measured.
+
+    The corrected model from start states fitted to the first 0.3 s, from one row before each window on, stands for the
+    truth. It is measured anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
+    by differences.
     """
     rng, model = np.random.default_rng(seed), world.model
     windows = consecutive(recordings, horizon)
-    windows = windows[:: -(-len(windows) // 100)]
+    windows = windows[:: -(-len(windows) // most)]
     early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
-    problem = shooting.Problem(world, early, position_noise, velocity_noise)
+    ends = [int(np.searchsorted(w.recording.time, w.recording.time[w.first] + cut.HORIZON * (1 + 1e-6), "right")) - 1 for w in windows]
+    begun = [w._replace(last=max(min(w.last, end), w.first + 1)) for w, end in zip(early, ends)]
+    problem = shooting.Problem(world, begun, position_noise, velocity_noise)
     fit = shooting.fit_starts(problem, shooting.Hypothesis(tuple(settings.items())), iterations=4)
     truth, speed = predict(world, settings, early, (fit.qpos, fit.qvel))
     finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
@@ -79,14 +93,9 @@ def floor_error(world, settings, recordings, position_noise, velocity_noise, hor
     spread = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0) * rng.normal(size=start.shape)
     start = np.where(measured, speed[every, at] + spread, start)
     predicted = predict(world, settings, windows, (noisy[every, at], start))[0]
-    rows = np.minimum(np.arange(1, predicted.shape[1]) + at[:, None], noisy.shape[1] - 1)
-    gap = cut.difference(model, predicted[:, 1:], noisy[every[:, None], rows])
-    known = np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows)))[:, 1:] & np.isfinite(gap)
-    square = np.where(known, gap**2, 0.0)
-    per_channel = {name: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
-                   for name, dofs in cut.channels(model).items() if known[..., dofs].any()}
-    noise = reporting_noise(position_noise)
-    return float(np.sqrt((square / noise**2).sum() / max(known.sum(), 1))), per_channel
+    rows = np.minimum(np.arange(predicted.shape[1]) + at[:, None], noisy.shape[1] - 1)
+    gap = cut.difference(model, predicted, noisy[every[:, None], rows])
+    return np.where(np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows))), gap, np.nan)
 
 
 def reporting_noise(position_noise):
@@ -94,18 +103,21 @@ def reporting_noise(position_noise):
     return np.where(np.isfinite(position_noise), np.maximum(position_noise, 1e-12), 1.0)
 
 
-def curve(world, settings_by_name, recordings, noise, longest=3 * cut.HORIZON, points=15):
-    """[{"seconds": t, name: error at t after the start, ...}]: error against horizon, in noises, up to `longest`."""
+def curve(world, settings, recordings, position_noise, velocity_noise, longest=3 * cut.HORIZON, points=15):
+    """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t up to `longest`."""
+    noise = reporting_noise(position_noise)
     windows = consecutive(recordings, longest)
     length = max(w.last - w.first for w in windows) + 1
     rows = np.unique(np.linspace(1, length - 1, min(points, length - 1)).round().astype(int))
     sample = np.median([(w.recording.time[w.last] - w.recording.time[w.first]) / (w.last - w.first) for w in windows])
     out = [{"seconds": float(r * sample)} for r in rows]
-    for name, settings in settings_by_name.items():
-        gap = cut.position_residual(world.model, windows, predict(world, settings, windows)[0]) / noise
+    gaps = {name: cut.position_residual(world.model, windows, predict(world, s, windows)[0])
+            for name, s in (("before", {}), ("after", settings))}
+    gaps["floor"] = floor_gaps(world, settings, recordings, position_noise, velocity_noise, longest, most=33)
+    for name, gap in gaps.items():
         with np.errstate(invalid="ignore"):
             for row, entry in zip(rows, out):
-                entry[name] = _rms(gap[:, row])
+                entry[name] = _rms(gap[:, row] / noise) if row < gap.shape[1] else None
     return out
 
 

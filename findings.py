@@ -79,7 +79,7 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
                "held_out": figure(world, settings, held, position_noise, velocity_noise)}
     figures["held_out"]["horizon_s"] = cut.HORIZON
-    figures["held_out"]["curve"] = evidence.curve(world, {"before": {}, "after": settings}, held, noise)
+    figures["held_out"]["curve"] = evidence.curve(world, settings, held, position_noise, velocity_noise)
     before, after, floor = (figures["held_out"][k] for k in ("before", "after", "floor"))
     findings = []
     xml, written = world.corrected_xml(settings)

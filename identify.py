@@ -29,6 +29,7 @@ LEAST_ROWS, LEAST_WINDOWS, FEW_ROWS = 8, 20, 100
 LEFTOVER_SPANS = 0.2, 0.1  # s
 STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up to which the curve does without them
 WORSE = 0.02  # of the reported error: more is no accident
+GROSS = 5.0  # residual of a window over the usual one, that it may count for
 MUCH = 4.0  # squared residual, over the noise's, with which a search does not end empty-handed
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
@@ -57,8 +58,8 @@ def identify(world, train, held_out, progress=None):
     hypothesis, left, hint = anything_left(data, search, hypothesis)
     hypothesis = shooting.Hypothesis(tuple((c, c.effect.canonical(values)) for c, values in hypothesis.effects))
     say(0.8, "intervals")
-    final = selection.Search(world, problem_of(*data, span, FINAL_STEPS), train)
-    fit = shooting.fit_starts(final.problem, hypothesis)
+    problem, fit = bounded(problem_of(*data, span, FINAL_STEPS), hypothesis)
+    final = selection.Search(world, problem, train)
     if hypothesis.effects:
         [fit] = shooting.solve(final.problem, [hypothesis], fit)
         fit = final.drop(fit, ())
@@ -87,17 +88,34 @@ def searched(data, say):
         for span in (longer, longer / 3):
             problem = problem_of(*data, span, SEARCH_STEPS)
             say(0.1 + 0.15 * i, f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
-            search = selection.Search(world, problem, train)
-            fit = shooting.fit_starts(problem, hypothesis)
-            if hypothesis.effects:
-                [fit] = shooting.solve(problem, [hypothesis], fit)
-                fit = search.drop(fit, ())
-            fit = search.run(fit)
-            if i or fit.hypothesis.effects or fit.chi2.sum() < MUCH * problem.rows:
+            search, fit = sought(world, train, problem, hypothesis)
+            if i or fit.hypothesis.effects or fit.chi2.sum() < MUCH * search.problem.rows:
                 break
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     return search, fit, ranking, span
+
+
+def sought(world, train, problem, hypothesis):
+    """(Search, Fit) of what a problem's windows say, begun at a hypothesis."""
+    problem, fit = bounded(problem, hypothesis)
+    search = selection.Search(world, problem, train)
+    if hypothesis.effects:
+        [fit] = shooting.solve(problem, [hypothesis], fit)
+        fit = search.drop(fit, ())
+    return search, search.run(fit)
+
+
+def bounded(problem, hypothesis):
+    """The problem with less weight on windows whose residual is GROSS beside the others', lest a few decide alone; a Fit."""
+    fit = shooting.fit_starts(problem, hypothesis)
+    each = fit.chi2 / np.maximum((problem.weight > 0).sum((1, 2)), 1)
+    factor = np.sqrt(np.minimum(GROSS**2 * max(np.median(each), 1.0) / np.maximum(each, 1e-300), 1.0))
+    if factor.min() == 1:
+        return problem, fit
+    problem = problem.subset(np.arange(len(each)))
+    problem.weight = problem.weight * factor[:, None, None]
+    return problem, shooting.fit_starts(problem, hypothesis, fit.qpos, fit.qvel, iterations=2)
 
 
 # ---- data --------------------------------------------------------------------------------------
@@ -214,8 +232,10 @@ def anything_left(data, search, hypothesis):
     """
     hint = None
     for problem in [search.problem] + [problem_of(*data, span, FINAL_STEPS) for span in LEFTOVER_SPANS]:
-        bare = shooting.fit_starts(problem, shooting.Hypothesis())
-        fit = shooting.fit_starts(problem, hypothesis) if hypothesis.effects else bare
+        fit = shooting.fit_starts(problem, hypothesis)
+        if unknown.quiet(problem, fit):
+            continue
+        bare = shooting.fit_starts(problem, shooting.Hypothesis()) if hypothesis.effects else fit
         found = unknown.leftover(search, problem, fit, bare.chi2.sum())
         hint = hint or found
         if not found or not found.large:
@@ -230,8 +250,19 @@ def anything_left(data, search, hypothesis):
                 rest = fit.chi2.sum()
                 if less.chi2.sum() < rest + min(STAND_IN * (bare.chi2.sum() - rest), 0.5 * (named - rest)):
                     fit = less
-        return fit.hypothesis, found, None
+        renamed = named_instead(selection.Search(search.world, problem, search.recordings), fit, curve)
+        return (renamed, None, None) if renamed else (fit.hypothesis, found, None)
     return hypothesis, None, hint
+
+
+def named_instead(search, fit, curve):
+    """The hypothesis with an effect of the catalogue in a curve's place, if one leaves no more than the curve; else None."""
+    others, _ = search.alternatives(fit, fit.subset(search.few), curve)
+    near = min(others, key=lambda o: o[0].chi2.sum(), default=None)
+    if near is None or near[0].chi2.sum() > (1 + selection.WORTH) * fit.chi2[search.few].sum():
+        return None
+    [new] = shooting.solve(search.problem, [near[0].hypothesis], fit)
+    return new.hypothesis if new.chi2.sum() < (1 + selection.WORTH) * fit.chi2.sum() else None
 
 
 def generalising(search, fit, windows, position_noise):
@@ -240,6 +271,7 @@ def generalising(search, fit, windows, position_noise):
         before, after = evidence.crossed(search, fit, windows, position_noise)
         if not after > (1 + WORSE) * before:
             break
-        weakest = max(fit.hypothesis.candidates, key=lambda c: search.significance(fit, c)[0])
+        # what only stands in for something else goes first
+        weakest = max(fit.hypothesis.candidates, key=lambda c: (c.effect.name == "unknown", search.significance(fit, c)[0]))
         [fit] = shooting.solve(search.problem, [fit.hypothesis.minus(weakest)], fit)
     return fit

@@ -81,7 +81,7 @@ def rippling(world, candidate, recordings):
 
 class Scan:
     def __init__(self, world, problem, recordings):
-        self.world, self.model, self.problem = world, world.model, problem
+        self.world, self.model, self.problem, self.recordings = world, world.model, problem, recordings
         self.options = options_of(world, recordings)
         # refits that only have to tell hypotheses apart use some of the windows
         few = max(FEW, len(problem.windows) // 4)
@@ -189,7 +189,7 @@ class Scan:
             if not columns:
                 continue
             pick = np.ix_(range(len(gram)), columns, columns)
-            value, gain, p, held = scores.wald(gram[pick], score[:, columns])
+            value, gain, p, held = scores.wald_but_one(gram[pick], score[:, columns])
             out.append(Trial(option, gain, p, float(held.sum()), self.start_of(option, columns, mine, value), columns, mine, value, chi2))
         out.sort(key=lambda t: -t.gain)
         return out, gram, score, chi2

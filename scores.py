@@ -10,6 +10,11 @@ import math
 import numpy as np
 
 
+LITTLE = 0.05  # of a column's size, seen outside a cluster, below which its value there counts as not known
+
+ALONE = 0.3  # of a column's size, in one cluster
+
+
 def f_survival(f, a, b):
     """P(F > f) of the F distribution with a and b degrees of freedom."""
     if not f > 0:
@@ -114,6 +119,19 @@ def wald(gram, score):
     size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     whitened = np.linalg.solve(covariance / size / size[:, None] + 1e-6 * np.eye(k), value / size)
     statistic = float(value / size @ whitened) / k * (count - k) / (count - 1)
-    unseen = solve_small(gram.sum(0) - gram, score.sum(0) - score)  # what the other clusters say
+    # what the other clusters say; nothing of what they hardly see
+    little = LITTLE * np.einsum("ckk->k", gram)[:, None] * np.eye(k)
+    unseen = solve_small(gram.sum(0) - gram + little, score.sum(0) - score)
     held = 2 * (score * unseen).sum(1) - np.einsum("ck,ckl,cl->c", unseen, gram, unseen)
     return value, gain, f_survival(statistic, k, count - k), held
+
+
+def wald_but_one(gram, score):
+    """wald, without the cluster that outweighs all others where that contradicts them: a derivative there is not to be trusted."""
+    whole, total = wald(gram, score), np.maximum(np.einsum("ckk->k", gram), 1e-300)
+    share = (np.einsum("ckk->ck", gram) / total).max(1)
+    loudest = int(np.argmax(share))
+    if share[loudest] < ALONE or len(gram) < 8:
+        return whole
+    rest = wald(np.delete(gram, loudest, 0), np.delete(score, loudest, 0))
+    return rest if rest[1] > whole[1] else whole

@@ -15,6 +15,7 @@ import shooting
 from scan import WORTH, Scan
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
+ODDS, DOUBT = 2.0, 8.0  # in squared residual: of an effect one level simpler; up to which few windows do not decide between two
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
 
 
@@ -136,7 +137,8 @@ class Search(Scan):
                     continue
             near = lambda f, c: simplicity(c)[:2] < simplicity(candidate)[:2] and f.chi2.sum() < (1 + WORTH) * small.chi2.sum()
             equals = [(small, candidate)] + [(f, c) for f, c in others if near(f, c) or not self.worse(f, small)]
-            best, name = min(equals, key=lambda e: simplicity(e[1]))
+            first = min(simplicity(c)[:2] for _, c in equals)
+            best, name = self.likeliest(fit, [e for e in equals if simplicity(e[1])[:2] == first])
             better = [e for e in equals if self.worse(small, e[0]) and e[0].chi2.sum() < (1 - WORTH) * small.chi2.sum()]
             if better:
                 best, name = min(better, key=lambda e: e[0].chi2.sum())
@@ -150,6 +152,18 @@ class Search(Scan):
             listed = [(ratio(f), c, f.hypothesis.settings[c]) for f, c in others]
             possible[candidate] = sorted(listed, key=lambda o: (round(o[0], 2), simplicity(o[1])))
         return fit, possible
+
+    def likeliest(self, fit, rivals, most=3):
+        """The likeliest of rivals [(Fit on few windows, candidate)] of equally many parameters, refitted to all windows."""
+        free = max(self.problem.rows - 2 * self.model.nv * len(self.problem.windows), 1)
+        scale = max(fit.chi2.sum() / free, 1.0)  # what a squared residual is worth where no model reaches the noise
+        odds = lambda fits, among: [f.chi2.sum() / scale + ODDS * c.effect.simplicity for f, (_, c) in zip(fits, among)]
+        few = odds([f for f, _ in rivals], rivals)
+        rivals = [rivals[i] for i in np.argsort(few, kind="stable")[:most] if few[i] < min(few) + DOUBT]
+        if len(rivals) == 1:
+            return rivals[0]
+        fits = shooting.solve(self.problem, [f.hypothesis for f, _ in rivals], fit, iterations=3)
+        return rivals[int(np.argmin(np.round(odds(fits, rivals), 1)))]
 
     def worse(self, one, other):
         """Whether a fit's squared residual (few windows) lies above another's beyond its scatter between clusters."""

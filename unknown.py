@@ -19,6 +19,7 @@ from scan import WORTH
 
 LEVEL = 0.002  # false-alarm rate, shared between all joints and variables
 SHARE, NOTABLE = 0.25, 0.05  # of the squared residual above the noise, and of the nominal model's, that a large leftover explains
+CLUSTERS = 60  # of windows, at most
 KNOTS = 7, 11  # of the curves that are tried
 QUIET = 1.15  # squared residual over that of noise alone, up to which nothing large can be left
 
@@ -102,15 +103,25 @@ def bases(world, v, joint):
     return out
 
 
+def freedom(problem):
+    """Measured rows that start states do not take up."""
+    return max(problem.rows - 2 * problem.model.nv * len(problem.windows), 1)
+
+
+def quiet(problem, fit):
+    """Whether nothing large can be left."""
+    return fit.chi2.sum() < QUIET * freedom(problem)
+
+
 def leftover(search, problem, fit, bare):
     """The dependence that explains most of what a fit leaves, if that is significant; else None.
 
     problem, fit: windows all over the data, and a fit to them; bare: the nominal model's squared residual.
     """
     world, model = search.world, search.model
-    free, chi2 = max(problem.rows - 2 * model.nv * len(problem.windows), 1), fit.chi2.sum()
+    free, chi2 = freedom(problem), fit.chi2.sum()
     pushes = [c for c in world.candidates if c.effect.name == "spring_offset"]
-    if not pushes or chi2 < QUIET * free:
+    if not pushes:
         return None
     nominal, own, v = fit.hypothesis.settings, shooting.perturbed(fit.hypothesis)[0], Variables(problem)
     tried, where = [{**nominal, c: (nominal.get(c, c.nominal)[0] + c.parameters[0].step,)} for c in pushes], []
@@ -122,7 +133,7 @@ def leftover(search, problem, fit, bare):
             tried += [{**nominal, curve: tuple(row)} for row in steps]
         where.append(mine)
     scan = shooting.project(problem, fit, shooting.columns(problem, [fit], [own + tried])[0])
-    labels, out, tests = scores.clusters(problem.windows), [], 0
+    labels, out, tests = scores.clusters(problem.windows, CLUSTERS), [], 0
     for i, (c, mine) in enumerate(zip(pushes, where)):
         column = len(own) + i
         if scan.gram[:, column, column].sum() < shooting.UNSEEN:
