@@ -37,7 +37,7 @@ class Engine:
         measures, sensor_measures = self._measures(cases)
         (offset, ratio, delay), recordings = measures, [w.recording for w in windows]
         # a window begins as long before its first row as its latest sensor is late, but not before the recording
-        early = np.maximum(delay.max(axis=1, initial=0.0), sensor_measures[2].max(axis=1, initial=0.0))
+        early = np.maximum(delay.max(axis=1, initial=0.0), sensors * sensor_measures[2].max(axis=1, initial=0.0))
         early = np.minimum(early, [w.recording.time[w.first] - w.recording.time[0] for w in windows])
         begin = np.array([w.recording.time[w.first] for w in windows]) - early
         q, v = self._true(start_qpos, start_qvel, measures)

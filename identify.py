@@ -111,11 +111,7 @@ def bounded(problem, hypothesis):
     fit = shooting.fit_starts(problem, hypothesis)
     each = fit.chi2 / np.maximum((problem.weight > 0).sum((1, 2)), 1)
     factor = np.sqrt(np.minimum(GROSS**2 * max(np.median(each), 1.0) / np.maximum(each, 1e-300), 1.0))
-    if factor.min() == 1:
-        return problem, fit
-    problem = problem.subset(np.arange(len(each)))
-    problem.weight = problem.weight * factor[:, None, None]
-    return problem, shooting.fit_starts(problem, hypothesis, fit.qpos, fit.qvel, iterations=2)
+    return (problem, fit) if factor.min() == 1 else problem.weighted(fit, factor)
 
 
 # ---- data --------------------------------------------------------------------------------------
@@ -139,7 +135,7 @@ def lowered_noise(world, train, position, velocity, hypothesis):
     model = world.model
     sample = np.median([np.median(np.diff(r.time)) for r in train])
     problem = problem_of(world, train, position, velocity, None, LEAST_ROWS * sample, SEARCH_STEPS)
-    fit, weight = shooting.fit_starts(problem, hypothesis), problem.weight
+    fit, weight = shooting.fit_starts(problem, hypothesis, sharp=False), problem.weight
     gap = fit.residual[:, :weight[0].size].reshape(weight.shape) / np.where(weight > 0, weight, 1)
     square, rows = np.where(weight > 0, gap**2, 0).sum(1), (weight > 0).sum(1)  # (W, 2 nv)
     left = np.array([np.sqrt(np.median(s[r > 3] / (r[r > 3] - 2))) if (r > 3).any() else np.inf for s, r in zip(square.T, rows.T)])
@@ -199,7 +195,7 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
 
     def followed(span):
         problem = problem_of(world, train, position_noise, velocity_noise, event, span, SEARCH_STEPS / 4)
-        return follows(problem, shooting.fit_starts(problem, hypothesis), FOLLOWS_SHARE if span < 0.6 * cut.HORIZON else 0.0)
+        return follows(problem, shooting.fit_starts(problem, hypothesis, sharp=False), FOLLOWS_SHARE if span < 0.6 * cut.HORIZON else 0.0)
 
     span = float(np.clip(cut.HORIZON / 2, shortest, longest))
     if followed(span):

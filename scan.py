@@ -56,7 +56,9 @@ def options_of(world, recordings):
     """Every way to try every candidate. Effects with probes of their own have no gradient at their nominal value."""
     out = []
     for candidate in world.candidates:
-        if candidate.effect.timed or candidate.effect.overrides("probes") and unseen(world, candidate.place, recordings):
+        if candidate.effect.timed or candidate.place.kind == "sensor":  # no residual holds sensors other than the joints'
+            continue
+        if candidate.effect.overrides("probes") and unseen(world, candidate.place, recordings):
             continue
         if candidate.effect.name == "cogging":
             candidate = rippling(world, candidate, recordings)

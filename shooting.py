@@ -18,6 +18,7 @@ import windows as cut
 
 UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a parameter counts as without effect
 BLOWN_UP = 1e3  # residual, in noises, of a prediction that is not finite
+KEPT = 12  # fits of start states that are remembered
 
 
 @dataclass(frozen=True)
@@ -101,15 +102,23 @@ class Problem:
         self.start_step = np.concatenate([0.5 * small, 0.5 * small / span])
         self.rows = int(self.weight.astype(bool).sum())
         self.size = self.weight[0].size + 2 * nv
+        self.key = tuple((id(r), *rows) for r, *rows in self.windows), position_noise.tobytes(), np.asarray(velocity_noise).tobytes()
 
     def subset(self, keep):
         out = object.__new__(Problem)
         out.__dict__.update(self.__dict__)
-        out.windows = [self.windows[i] for i in keep]
+        out.windows, out.key = [self.windows[i] for i in keep], None
         for name in ("measured_qpos", "measured_qvel", "weight", "guess_qpos", "guess_qvel"):
             setattr(out, name, getattr(self, name)[keep])
         out.rows = int(out.weight.astype(bool).sum())
         return out
+
+    def weighted(self, fit, factor):
+        """This problem and a fit of it with every window's measurements weighted by a factor (W,) more."""
+        out, size = self.subset(np.arange(len(self.windows))), self.weight[0].size
+        out.weight = self.weight * factor[:, None, None]
+        scale = np.where(np.arange(self.size) < size, factor[:, None], 1.0)
+        return out, Fit(fit.hypothesis, fit.qpos, fit.qvel, fit.residual * scale, fit.start_jacobian * scale[..., None])
 
     def refined(self, fit):
         """The same fit with its residual as half the time step would give it."""
@@ -157,46 +166,63 @@ def _eliminate(jacobian, damping):
     return np.linalg.inv(normal)
 
 
-def fit_starts(problem, hypothesis, qpos=None, qvel=None, iterations=8):
-    """Start states of all windows under one hypothesis, by Levenberg-Marquardt, damped window by window."""
+def fit_starts(problem, hypothesis, iterations=8, sharp=True):
+    """Start states of all windows under one hypothesis, by Levenberg-Marquardt, damped window by window.
+
+    sharp: with a start Jacobian of the states found, for whoever looks at columns next. The latest fits are remembered.
+    """
+    kept, key = problem.world.fits, (problem.key, hypothesis, iterations, sharp)
+    if key in kept:
+        return kept[key]
     every, settings = np.arange(len(problem.windows)), [hypothesis.settings] * len(problem.windows)
-    qpos = problem.guess_qpos if qpos is None else qpos
-    qvel = problem.guess_qvel if qvel is None else qvel
-    residual = problem.residuals(settings, every, qpos, qvel)
-    begun = Fit(hypothesis, qpos, qvel, residual, problem.start_jacobians(settings, every, qpos, qvel, residual))
-    return _fit_starts(problem, [begun], iterations, renew=True)[0]
+    jacobian = lambda *fit: Fit(hypothesis, *fit, problem.start_jacobians(settings, every, *fit))
+    if sharp:
+        fit = fit_starts(problem, hypothesis, iterations, sharp=False)
+        begun = jacobian(fit.qpos, fit.qvel, fit.residual)
+    else:
+        qpos, qvel = problem.guess_qpos, problem.guess_qvel
+        begun = jacobian(qpos, qvel, problem.residuals(settings, every, qpos, qvel))
+    [fit] = _fit_starts(problem, [begun], 2 if sharp else iterations, fresh=True)
+    if problem.key:
+        kept[key] = fit
+        if len(kept) > KEPT:
+            del kept[next(iter(kept))]
+    return fit
 
 
 def follow(problem, begun, iterations):
-    """Fits whose parameters stand as begun (a list of Fit), with start states adapted to them.
-
-    Their start Jacobians, of another hypothesis perhaps, serve in every window until a step fails there.
-    """
-    return _fit_starts(problem, begun, iterations, renew=False) if begun else []
+    """Fits whose parameters stand as begun (a list of Fit), with start states adapted to them."""
+    return _fit_starts(problem, begun, iterations, fresh=False) if begun else []
 
 
-def _fit_starts(problem, begun, iterations, renew):
-    """The start states of several Fits at once; renew: a new Jacobian after every step that gained, not only where one failed."""
+def _fit_starts(problem, begun, iterations, fresh):
+    """The start states of several Fits at once. A window's Jacobian follows its steps by Broyden's update; it is computed
+    anew only where a step fails with one that is not fresh (of this very state and hypothesis)."""
     number, every = len(problem.windows), np.arange(len(begun) * len(problem.windows))
     which = every % number
     settings = [s for f in begun for s in [f.hypothesis.settings] * number]
     pick = lambda rows: ([settings[i] for i in rows], which[rows])
     qpos, qvel, residual, jacobian = (np.concatenate([getattr(f, x) for f in begun]) for x in ("qpos", "qvel", "residual", "start_jacobian"))
-    damping, active = np.full(len(every), 1e-3), every
+    damping, fresh, active = np.full(len(every), 1e-3), np.full(len(every), fresh), every
     for i in range(iterations):
-        inverse = _eliminate(jacobian[active], damping[active])
-        step = np.einsum("wij,wmj,wm->wi", inverse, jacobian[active], residual[active])
+        slope = jacobian[active]
+        step = np.einsum("wij,wmj,wm->wi", _eliminate(slope, damping[active]), slope, residual[active])
         new_qpos, new_qvel = problem.moved(qpos[active], qvel[active], step)
         new = problem.residuals(*pick(active), new_qpos, new_qvel)
         old_cost, new_cost = (residual[active] ** 2).sum(1), (new**2).sum(1)
         better = new_cost < old_cost
         gained = better & (old_cost - new_cost > 1e-3 * old_cost)
         good = active[better]
+        missed = residual[good] - new[better] - np.einsum("wmj,wj->wm", slope[better], step[better])
+        along = step[better] * np.einsum("wmj,wmj->wj", slope[better], slope[better])  # in noises, not in m and rad/s
+        jacobian[good] += missed[..., None] * (along / (along * step[better]).sum(1, keepdims=True).clip(1e-300))[:, None]
         qpos[good], qvel[good], residual[good] = new_qpos[better], new_qvel[better], new[better]
-        damping[active] = np.where(better, damping[active] / 10, damping[active] * (10 if renew else 1))
-        again = active[gained] if renew else active[~better]
-        if len(again) and (renew or i < iterations - 1):
+        damping[active] *= np.where(better, 0.1, np.where(fresh[active], 10.0, 1.0))
+        again = active[~better & ~fresh[active]]
+        fresh[good] = False
+        if len(again) and i < iterations - 1:
             jacobian[again] = problem.start_jacobians(*pick(again), qpos[again], qvel[again], residual[again])
+            fresh[again] = True
         active = active[gained | (~better & (damping[active] < 1e3))]
         if not len(active):
             break
@@ -325,19 +351,24 @@ def _polish(problem, current, which):
 
 
 def evaluate(problem, hypotheses, warm):
-    """Fits at hypotheses as they stand: each window from its start state in warm (a Fit, or one for each), or from the
-    recorded one where that does better (a wrong model's impacts can push its start states far off)."""
+    """Fits at hypotheses as they stand: each window from its start state in warm (a Fit, or one for each), or, where it
+    leaves more than in warm, from the recorded one if that does better (impacts can push start states far off)."""
     warm = warm if isinstance(warm, list) else [warm] * len(hypotheses)
     if not hypotheses:
         return []
-    number, times = len(problem.windows), 2 * len(hypotheses)
-    starts = [np.concatenate([getattr(f, field) for f in warm] + [getattr(problem, f"guess_{field}")] * len(hypotheses))
-              for field in ("qpos", "qvel")]
-    residual = problem.residuals([s for h in hypotheses * 2 for s in [h.settings] * number],
-                                 np.tile(np.arange(number), times), *starts)
-    cost = (residual**2).sum(1).reshape(2, -1)
-    pick = np.argmin(cost, 0) * cost.shape[1] + np.arange(cost.shape[1])
-    parts = (np.split(x[pick], len(hypotheses)) for x in (*starts, residual))
+    which = np.tile(np.arange(len(problem.windows)), len(hypotheses))
+    settings = [s for h in hypotheses for s in [h.settings] * len(problem.windows)]
+    qpos, qvel = (np.concatenate([getattr(f, x) for f in warm]) for x in ("qpos", "qvel"))
+    residual = problem.residuals(settings, which, qpos, qvel)
+    cost = (residual**2).sum(1)
+    worse = np.flatnonzero(cost > np.concatenate([f.chi2 for f in warm]))
+    if len(worse):
+        recorded = problem.guess_qpos[which[worse]], problem.guess_qvel[which[worse]]
+        other = problem.residuals([settings[i] for i in worse], which[worse], *recorded)
+        better = (other**2).sum(1) < cost[worse]
+        for x, y in zip((qpos, qvel, residual), (*recorded, other)):
+            x[worse[better]] = y[better]
+    parts = (np.split(x, len(hypotheses)) for x in (qpos, qvel, residual))
     return [Fit(h, q, v, r, f.start_jacobian) for h, f, q, v, r in zip(hypotheses, warm, *parts)]
 
 

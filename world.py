@@ -55,6 +55,7 @@ class World:
                 parameters = effect.parameters(self.model, effect.id(self.model, name))
                 self.candidates.append(Candidate(effect, Place(effect.kind, name), tuple(parameters)))
         self._engines = {}
+        self.fits = {}  # of start states, that shooting remembers for as long as this world is looked at
 
     @classmethod
     def load(cls, path):
@@ -153,10 +154,10 @@ class World:
             if id(setting) not in cases:
                 cases[id(setting)] = Case(self.model, setting, refine)
             case = cases[id(setting)]
-            groups.setdefault((case.structure, case.step, case.stepwise), []).append((s, case))
+            groups.setdefault((case.structure, case.step, case.stepwise, case.late), []).append((s, case))
         start_qpos, start_qvel = np.asarray(start_qpos, float), np.asarray(start_qvel, float)
         with quiet():
-            for (structure, step, stepwise), members in groups.items():
+            for (structure, step, *_), members in groups.items():
                 if structure not in self._engines:
                     self._engines[structure] = Engine(self.spec, self.model, structure)
                 engine = self._engines[structure]
@@ -216,6 +217,7 @@ class Case:
         self.step = (steps[0] if steps else model.opt.timestep) / refine
         self.structure = frozenset(c for c, _ in self.on if c.effect.overrides('build'))
         self.stepwise = bool(self.when) or any(c.effect.overrides('force') for c, _ in self.on)
+        self.late = any(c.effect.measure(v)[2] for c, v in self.on)  # which takes a start of its own
 
 
 @contextmanager
