@@ -30,7 +30,7 @@ LEFTOVER_SPANS = 0.2, 0.1  # s
 STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up to which the curve does without them
 WORSE = 0.02  # of the reported error: more is no accident
 GROSS = 5.0  # residual of a window over the usual one, that it may count for
-MUCH = 4.0  # squared residual, over the noise's, with which a search does not end empty-handed
+MUCH, UNFOUND = 4.0, 0.05  # squared residual, over the noise's and the nominal model's, above which shorter windows are tried
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
@@ -76,7 +76,7 @@ def identify(world, train, held_out, progress=None):
 def searched(data, say):
     """Rounds of search with longer and longer windows: (Search, Fit, first ranking, last span).
 
-    Where the first finds nothing though much is left, windows were too long for that: motion far off is soon not linear.
+    Where the first leaves much unfound, windows were too long for that: motion far off is soon not linear.
     """
     world, train = data[:2]
     hypothesis, ranking, span = shooting.Hypothesis(), [], 0.0
@@ -85,25 +85,29 @@ def searched(data, say):
         longer = span_for(*data, hypothesis, at_least=span)
         if i and longer < 1.5 * span:
             break
-        for span in (longer, longer / 3):
-            problem = problem_of(*data, span, SEARCH_STEPS)
-            say(0.1 + 0.15 * i, f"searching {len(world.candidates)} candidates in {span:.2g} s windows")
-            search, fit = sought(world, train, problem, hypothesis)
-            if i or fit.hypothesis.effects or fit.chi2.sum() < MUCH * search.problem.rows:
-                break
+        say(0.1 + 0.15 * i, f"searching {len(world.candidates)} candidates in {longer:.2g} s windows")
+        search, fit, before = sought(world, train, problem_of(*data, longer, SEARCH_STEPS), hypothesis)
+        span = longer
+        if not i and fit.chi2.sum() > max(MUCH * search.problem.rows, UNFOUND * before):
+            say(0.15, f"searching {len(world.candidates)} candidates in {longer / 3:.2g} s windows")
+            other, less, _ = sought(world, train, problem_of(*data, longer / 3, SEARCH_STEPS), hypothesis)
+            [again] = shooting.solve(other.problem, [fit.hypothesis], less)
+            if not fit.hypothesis.effects or less.chi2.sum() < (1 - selection.WORTH) * again.chi2.sum():
+                search, fit, span = other, less, longer / 3
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     return search, fit, ranking, span
 
 
 def sought(world, train, problem, hypothesis):
-    """(Search, Fit) of what a problem's windows say, begun at a hypothesis."""
+    """(Search, Fit, squared residual at the beginning) of what a problem's windows say, begun at a hypothesis."""
     problem, fit = bounded(problem, hypothesis)
+    before = fit.chi2.sum()
     search = selection.Search(world, problem, train)
     if hypothesis.effects:
         [fit] = shooting.solve(problem, [hypothesis], fit)
         fit = search.drop(fit, ())
-    return search, search.run(fit)
+    return search, search.run(fit), before
 
 
 def bounded(problem, hypothesis):
@@ -227,7 +231,9 @@ def anything_left(data, search, hypothesis):
     them, and much more than they do without it.
     """
     hint = None
-    for problem in [search.problem] + [problem_of(*data, span, FINAL_STEPS) for span in LEFTOVER_SPANS]:
+    shortest = LEAST_ROWS * np.median([np.median(np.diff(r.time)) for r in data[1]])
+    spans = sorted({max(span, shortest) for span in LEFTOVER_SPANS}, reverse=True)
+    for problem in [search.problem] + [problem_of(*data, span, FINAL_STEPS) for span in spans]:
         fit = shooting.fit_starts(problem, hypothesis)
         if unknown.quiet(problem, fit):
             continue

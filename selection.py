@@ -16,6 +16,7 @@ from scan import WORTH, Scan
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 ODDS, DOUBT = 2.0, 8.0  # in squared residual: of an effect one level simpler; up to which few windows do not decide between two
+LESS = 0.03  # share of an effect, from whose absence that of the whole is extrapolated
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
 
 
@@ -189,14 +190,14 @@ class Search(Scan):
         without = small.hypothesis.minus(candidate)
         own = [{**s, candidate: values} for s in shooting.perturbed(without)[0]]
         options = [o for o in self.options if o.candidate not in small.hypothesis.candidates and (o.linear or o in self.kept)]
-        # absence is extrapolated from a tenth less, unless the effect is a limit: unstable motion is soon not linear
+        # absence is extrapolated from a little less, unless the effect is a limit: unstable motion is soon not linear
         nominal, less = np.array(candidate.nominal), without.settings
-        tenth = np.isfinite(nominal).all()
-        if tenth:
-            less = without.plus(candidate, nominal + 0.9 * (np.array(values) - nominal)).settings
+        finite = np.isfinite(nominal).all()
+        if finite:
+            less = without.plus(candidate, nominal + (1 - LESS) * (np.array(values) - nominal)).settings
         known = {o: columns[self.few] for o, (at, columns) in self.looked.items() if at is fit}
         slope = self.stacked(self.small, small, own + [less], options, known)
-        slope[..., len(own)] *= 10.0 if tenth else 1.0
+        slope[..., len(own)] *= 1 / LESS if finite else 1.0
         scan = shooting.project(self.small, small, slope)
         gram, k = scan.gram.sum(0), len(own)
         score = scan.score.sum(0) - gram[:, k]  # of the residual without the effect
@@ -219,17 +220,18 @@ class Search(Scan):
                 singles.append((chi2, option, columns, start))
         singles.sort(key=lambda s: s[0])
         now = scan.chi2.sum()
-        hypotheses, seen, akin = [], set(), set(self.world.related(candidate))
+        hypotheses, same, seen, akin = [], [], set(), set(self.world.related(candidate))
         for chi2, option, _, start in singles:
             stands = len(seen) < 2 * most and alone - chi2 > 0.5 * (alone - now)
             if option.candidate not in seen and (stands or option.candidate in akin):
                 hypotheses.append(without.plus(option.candidate, start))
+                same.append(chi2 < now + LESS * (alone - now))
                 seen.add(option.candidate)
         # a first look at full size, where what is alike in a small step may differ, and the other way round
         looks = [shooting.project(self.small, f, np.zeros(f.residual.shape + (0,))).chi2.sum()
                  for f in shooting.evaluate(self.small, hypotheses, small)]
         order = sorted(range(len(looks)), key=looks.__getitem__)[:most]
-        hypotheses = [hypotheses[i] for i in order if looks[i] < now + 0.5 * (alone - now)]
+        hypotheses = [hypotheses[i] for i in order if same[i] or looks[i] < now + 0.5 * (alone - now)]
         pair = None
         pairs = [(left(a[2] + b[2])[0], a, b) for i, a in enumerate(singles[:8]) for b in singles[i + 1:8] if a[1].candidate != b[1].candidate]
         if pairs:
