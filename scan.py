@@ -44,6 +44,11 @@ class Trial:
     chi2: float  # before
 
 
+def freedom(problem):
+    """Measured rows that start states do not take up."""
+    return max(problem.rows - 2 * problem.model.nv * len(problem.windows), 1)
+
+
 def unseen(world, place, recordings):
     """Whether a place is a joint whose position was never measured: nothing tells where its probes should lie."""
     if place.kind != "joint":
@@ -85,6 +90,7 @@ class Scan:
     def __init__(self, world, problem, recordings):
         self.world, self.model, self.problem, self.recordings = world, world.model, problem, recordings
         self.options = options_of(world, recordings)
+        self.freedom = freedom(problem)
         # refits that only have to tell hypotheses apart use some of the windows
         few = max(FEW, len(problem.windows) // 4)
         self.few = np.unique(np.linspace(0, len(problem.windows) - 1, min(few, len(problem.windows))).round().astype(int))

@@ -16,6 +16,7 @@ from scan import WORTH, Scan
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 ODDS, DOUBT = 2.0, 8.0  # in squared residual: of an effect one level simpler; up to which few windows do not decide between two
+FAR = 2.0  # squared residual over the noise's
 LESS = 0.03  # share of an effect, from whose absence that of the whole is extrapolated
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
 
@@ -156,8 +157,7 @@ class Search(Scan):
 
     def likeliest(self, fit, rivals, most=3):
         """The likeliest of rivals [(Fit on few windows, candidate)] of equally many parameters, refitted to all windows."""
-        free = max(self.problem.rows - 2 * self.model.nv * len(self.problem.windows), 1)
-        scale = max(fit.chi2.sum() / free, 1.0)  # what a squared residual is worth where no model reaches the noise
+        scale = max(fit.chi2.sum() / self.freedom, 1.0)  # what a squared residual is worth where no model reaches the noise
         odds = lambda fits, among: [f.chi2.sum() / scale + ODDS * c.effect.simplicity for f, (_, c) in zip(fits, among)]
         few = odds([f for f, _ in rivals], rivals)
         rivals = [rivals[i] for i in np.argsort(few, kind="stable")[:most] if few[i] < min(few) + DOUBT]
@@ -231,7 +231,10 @@ class Search(Scan):
         looks = [shooting.project(self.small, f, np.zeros(f.residual.shape + (0,))).chi2.sum()
                  for f in shooting.evaluate(self.small, hypotheses, small)]
         order = sorted(range(len(looks)), key=looks.__getitem__)[:most]
-        hypotheses = [hypotheses[i] for i in order if same[i] or looks[i] < now + 0.5 * (alone - now)]
+        order = [i for i in order if same[i] or looks[i] < now + 0.5 * (alone - now)]
+        if fit.chi2.sum() > FAR * self.freedom:  # where no model reaches the noise, related ones may predict as well
+            order += [i for i in range(len(looks)) if i not in order and hypotheses[i].candidates[-1] in akin]
+        hypotheses = [hypotheses[i] for i in order]
         pair = None
         pairs = [(left(a[2] + b[2])[0], a, b) for i, a in enumerate(singles[:8]) for b in singles[i + 1:8] if a[1].candidate != b[1].candidate]
         if pairs:

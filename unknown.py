@@ -15,7 +15,7 @@ import numpy as np
 import scores
 import shooting
 import windows as cut
-from scan import WORTH
+from scan import WORTH, freedom
 
 LEVEL = 0.002  # false-alarm rate, shared between all joints and variables
 SHARE, NOTABLE = 0.25, 0.05  # of the squared residual above the noise, and of the nominal model's, that a large leftover explains
@@ -101,11 +101,6 @@ def bases(world, v, joint):
         phase = 2 * np.pi * hertz * v.time
         out.append((("time",), np.stack([np.cos(phase), np.sin(phase)], 1), world.curve(name, "time", (0.0, 0.25 / hertz), wave=True)))
     return out
-
-
-def freedom(problem):
-    """Measured rows that start states do not take up."""
-    return max(problem.rows - 2 * problem.model.nv * len(problem.windows), 1)
 
 
 def quiet(problem, fit):
