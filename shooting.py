@@ -18,6 +18,7 @@ import windows as cut
 
 UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a parameter counts as without effect
 BLOWN_UP = 1e3  # residual, in noises, of a prediction that is not finite
+GOOD = 0.5  # share of the fall of the squared residual that a Jacobian promised, from which on it is kept
 KEPT = 12  # fits of start states that are remembered
 
 
@@ -166,7 +167,7 @@ def _eliminate(jacobian, damping):
     return np.linalg.inv(normal)
 
 
-def fit_starts(problem, hypothesis, iterations=8, sharp=True):
+def fit_starts(problem, hypothesis, iterations=12, sharp=True):
     """Start states of all windows under one hypothesis, by Levenberg-Marquardt, damped window by window.
 
     sharp: with a start Jacobian of the states found, for whoever looks at columns next. The latest fits are remembered.
@@ -197,7 +198,7 @@ def follow(problem, begun, iterations):
 
 def _fit_starts(problem, begun, iterations, fresh):
     """The start states of several Fits at once. A window's Jacobian follows its steps by Broyden's update; it is computed
-    anew only where a step fails with one that is not fresh (of this very state and hypothesis)."""
+    anew only where a step brings little of what it promised, unless it was fresh (of this very state and hypothesis)."""
     number, every = len(problem.windows), np.arange(len(begun) * len(problem.windows))
     which = every % number
     settings = [s for f in begun for s in [f.hypothesis.settings] * number]
@@ -213,17 +214,20 @@ def _fit_starts(problem, begun, iterations, fresh):
         better = new_cost < old_cost
         gained = better & (old_cost - new_cost > 1e-3 * old_cost)
         good = active[better]
-        missed = residual[good] - new[better] - np.einsum("wmj,wj->wm", slope[better], step[better])
+        foreseen = np.einsum("wmj,wj->wm", slope, step)  # change of the prediction
+        promised = old_cost - ((residual[active] - foreseen) ** 2).sum(1)
+        stale = ~fresh[active] & (old_cost - new_cost < GOOD * promised) & (promised > 1e-3 * old_cost)
+        missed = residual[good] - new[better] - foreseen[better]
         along = step[better] * np.einsum("wmj,wmj->wj", slope[better], slope[better])  # in noises, not in m and rad/s
         jacobian[good] += missed[..., None] * (along / (along * step[better]).sum(1, keepdims=True).clip(1e-300))[:, None]
         qpos[good], qvel[good], residual[good] = new_qpos[better], new_qvel[better], new[better]
-        damping[active] *= np.where(better, 0.1, np.where(fresh[active], 10.0, 1.0))
-        again = active[~better & ~fresh[active]]
+        damping[active] *= np.where(better, 0.1, np.where(stale, 1.0, 10.0))
         fresh[good] = False
+        again = active[stale]
         if len(again) and i < iterations - 1:
             jacobian[again] = problem.start_jacobians(*pick(again), qpos[again], qvel[again], residual[again])
             fresh[again] = True
-        active = active[gained | (~better & (damping[active] < 1e3))]
+        active = active[gained | stale | (~better & (damping[active] < 1e3))]
         if not len(active):
             break
     parts = (np.split(x, len(begun)) for x in (qpos, qvel, residual, jacobian))
