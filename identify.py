@@ -27,6 +27,7 @@ SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the sea
 FINAL_STEPS = 30000
 LEAST_ROWS, LEAST_WINDOWS, FEW_ROWS = 8, 20, 100
 LEFTOVER_SPANS = 0.2, 0.1  # s
+MOST = 0.7  # share of the squared residual, that a leftover explains, above which no shorter windows are asked
 STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up to which the curve does without them
 WORSE = 0.02  # of the reported error: more is no accident
 GROSS = 5.0  # residual of a window over the usual one, that it may count for
@@ -230,7 +231,7 @@ def anything_left(data, search, hypothesis):
     Named effects that only stood in for it go, all of them or one after the other: where it explains as much without
     them, and much more than they do without it.
     """
-    hint = None
+    hint, best = None, None
     shortest = LEAST_ROWS * np.median([np.median(np.diff(r.time)) for r in data[1]])
     spans = sorted({max(span, shortest) for span in LEFTOVER_SPANS}, reverse=True)
     for problem in [search.problem] + [problem_of(*data, span, FINAL_STEPS) for span in spans]:
@@ -240,21 +241,25 @@ def anything_left(data, search, hypothesis):
         bare = shooting.fit_starts(problem, shooting.Hypothesis()) if hypothesis.effects else fit
         found = unknown.leftover(search, problem, fit, bare.chi2.sum())
         hint = hint or found
-        if not found or not found.large:
-            continue
-        curve, named = found.candidate, fit.chi2.sum()
-        [fit] = shooting.solve(problem, [hypothesis.plus(curve, curve.nominal)], fit)
-        for gone in [hypothesis.candidates] + [(c,) for c in hypothesis.candidates]:
-            shorter = shooting.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in gone))
-            if len(shorter.effects) < len(fit.hypothesis.effects):
-                shorter = shorter.plus(curve, curve.nominal)
-                [less] = shooting.solve(problem, [shorter], bare if len(shorter.effects) == 1 else fit)
-                rest = fit.chi2.sum()
-                if less.chi2.sum() < rest + min(STAND_IN * (bare.chi2.sum() - rest), 0.5 * (named - rest)):
-                    fit = less
-        renamed = named_instead(selection.Search(search.world, problem, search.recordings), fit, curve)
-        return (renamed, None, None) if renamed else (fit.hypothesis, found, None)
-    return hypothesis, None, hint
+        if found and found.large and (best is None or found.share > best[0].share):
+            best = found, problem, fit, bare
+        if best and best[0].share > MOST:
+            break
+    if best is None:
+        return hypothesis, None, hint
+    found, problem, fit, bare = best
+    curve, named = found.candidate, fit.chi2.sum()
+    [fit] = shooting.solve(problem, [hypothesis.plus(curve, curve.nominal)], fit)
+    for gone in [hypothesis.candidates] + [(c,) for c in hypothesis.candidates]:
+        shorter = shooting.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in gone))
+        if len(shorter.effects) < len(fit.hypothesis.effects):
+            shorter = shorter.plus(curve, curve.nominal)
+            [less] = shooting.solve(problem, [shorter], bare if len(shorter.effects) == 1 else fit)
+            rest = fit.chi2.sum()
+            if less.chi2.sum() < rest + min(STAND_IN * (bare.chi2.sum() - rest), 0.5 * (named - rest)):
+                fit = less
+    renamed = named_instead(selection.Search(search.world, problem, search.recordings), fit, curve)
+    return (renamed, None, None) if renamed else (fit.hypothesis, found, None)
 
 
 def named_instead(search, fit, curve):
