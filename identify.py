@@ -234,7 +234,7 @@ def anything_left(data, search, hypothesis):
     hint, best = None, None
     shortest = LEAST_ROWS * np.median([np.median(np.diff(r.time)) for r in data[1]])
     spans = sorted({max(span, shortest) for span in LEFTOVER_SPANS}, reverse=True)
-    for problem in [search.problem] + [problem_of(*data, span, FINAL_STEPS) for span in spans]:
+    for problem in [search.problem] + [problem_of(*data, span, SEARCH_STEPS) for span in spans]:
         fit = shooting.fit_starts(problem, hypothesis)
         if unknown.quiet(problem, fit):
             continue

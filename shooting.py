@@ -19,6 +19,7 @@ import windows as cut
 UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a parameter counts as without effect
 BLOWN_UP = 1e3  # residual, in noises, of a prediction that is not finite
 GOOD = 0.5  # share of the fall of the squared residual that a Jacobian promised, from which on it is kept
+BLOCK_BYTES = 16e6  # of residuals worked out at a time
 KEPT = 12  # fits of start states that are remembered
 
 
@@ -129,7 +130,12 @@ class Problem:
 
     def residuals(self, settings, which, qpos, qvel, refine=1):
         """(S, m): S simulations, the i-th in window which[i] under settings[i] from (qpos[i], qvel[i])."""
-        which = np.asarray(which)
+        which, block = np.asarray(which), max(1, int(BLOCK_BYTES / (8 * self.size)))
+        if len(which) > block:
+            out = np.empty((len(which), self.size))
+            for some in (slice(a, a + block) for a in range(0, len(which), block)):
+                out[some] = self.residuals(settings[some], which[some], qpos[some], qvel[some], refine)
+            return out
         predicted_qpos, predicted_qvel = self.world.simulate(settings, qpos, qvel, [self.windows[i] for i in which], refine)
         short = ((0, 0), (0, self.weight.shape[1] - predicted_qpos.shape[1]), (0, 0))  # these may be the shorter windows
         predicted_qpos, predicted_qvel = np.pad(predicted_qpos, short), np.pad(predicted_qvel, short)
@@ -265,8 +271,8 @@ def columns(problem, fits, settings):
     moved = moved.reshape(-1, len(every), problem.size)
     out, at = [], 0
     for fit, listed in zip(fits, settings):
-        block = fit.residual[None] - moved[at:at + len(listed)]
-        out.append(np.moveaxis(block, 0, -1))
+        block = moved[at:at + len(listed)]
+        out.append(np.moveaxis(np.subtract(fit.residual, block, out=block), 0, -1))
         at += len(listed)
     return out
 
@@ -421,17 +427,14 @@ def project(problem, fit, slope, pieces=1):
 
     pieces: a window's rows are summed in this many consecutive pieces (more than one where windows are few).
     """
-    q, _ = np.linalg.qr(fit.start_jacobian)
-    residual = fit.residual - np.einsum("wmi,wi->wm", q, np.einsum("wmi,wm->wi", q, fit.residual))
-    slope = slope - q @ (np.swapaxes(q, 1, 2) @ slope)
     number, rows, width = problem.weight.shape
     owner = np.concatenate([np.repeat(np.arange(rows) * pieces // rows, width), np.zeros(2 * problem.model.nv, int)])
-    chi2, score, gram = [], [], []
-    for piece in range(pieces):
-        mine = owner == piece
-        c, r = slope[:, mine], residual[:, mine]
-        chi2.append((r**2).sum(1))
-        score.append(np.einsum("wmk,wm->wk", c, r))
-        gram.append(np.swapaxes(c, 1, 2) @ c)
-    flat = lambda x: np.stack(x, 1).reshape((number * pieces,) + x[0].shape[1:])
+    chi2, score, gram = (np.empty((number, pieces) + (slope.shape[-1],) * k) for k in range(3))
+    for w in range(number):  # one after the other: columns are many, and large
+        q, _ = np.linalg.qr(fit.start_jacobian[w])
+        residual, columns = (x - q @ (q.T @ x) for x in (fit.residual[w], slope[w]))
+        for piece in range(pieces):
+            c, r = columns[owner == piece], residual[owner == piece]
+            chi2[w, piece], score[w, piece], gram[w, piece] = r @ r, r @ c, c.T @ c
+    flat = lambda x: x.reshape((number * pieces,) + x.shape[2:])
     return Scan(flat(chi2), flat(score), flat(gram))

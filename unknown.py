@@ -20,7 +20,7 @@ from scan import WORTH, freedom
 LEVEL = 0.002  # false-alarm rate, shared between all joints and variables
 SHARE, NOTABLE = 0.25, 0.05  # of the squared residual above the noise, and of the nominal model's, that a large leftover explains
 CLUSTERS = 60  # of windows, at most
-KNOTS = 7, 11  # of the curves that are tried
+KNOTS = 11  # of the curves that are tried, and of those with every other knot
 QUIET = 1.15  # squared residual over that of noise alone, up to which nothing large can be left
 
 
@@ -72,8 +72,14 @@ def curves(world, problem, v, joint):
     seen = {f"position:{name}": np.concatenate([s[0][:, model.jnt_qposadr[joint]] for s in known]),
             f"velocity:{name}": np.concatenate([s[1][:, model.jnt_dofadr[joint]] for s in known])}
     seen |= {label: u for label, u in controls(model, v, joint)}
-    out = {world.curve(name, label, knots) for label, x in seen.items() for n in KNOTS if len(knots := spread_knots(x, n)) > 2}
-    return sorted(out, key=lambda c: (c.effect.variable, len(c.effect.knots)))
+    return [world.curve(name, label, knots) for label, x in seen.items() if len(knots := spread_knots(x, KNOTS)) > 2]
+
+
+def coarser(world, curve):
+    """(a curve, weights (k, n) of its n knots' forces in the given curve's k) of the curve itself and of one with every other knot."""
+    knots, effect = np.array(curve.effect.knots), curve.effect
+    some = np.unique([*knots[::2], knots[-1]])
+    return [(curve, np.eye(len(knots)))] + ([(world.curve(curve.place.name, effect.variable, some), hats(knots, some))] if len(some) > 2 else [])
 
 
 def controls(model, v, joint):
@@ -94,7 +100,7 @@ def bases(world, v, joint):
     knots = np.linspace(v.time.min(), v.time.max(), 4)
     for label, u in controls(model, v, joint):
         out.append((("time", label), hats(v.time, knots) * u[:, None], world.curve(name, "time", knots, factor=label)))
-    knots = np.linspace(v.time.min(), v.time.max(), KNOTS[0])
+    knots = np.linspace(v.time.min(), v.time.max(), 7)
     out.append((("time",), hats(v.time, knots), world.curve(name, "time", knots)))
     length = np.ptp(v.time)
     for hertz in np.arange(1.0, 0.7 * length / v.span, 0.5) / length:
@@ -134,7 +140,8 @@ def leftover(search, problem, fit, bare):
         if scan.gram[:, column, column].sum() < shooting.UNSEEN:
             continue
         base = [*range(len(own)), column]
-        options = [((curve.effect.variable,), picked(scan, base, columns), curve) for curve, columns in mine]
+        options = [((curve.effect.variable,), mixed(scan, base, columns, weights), curve)
+                   for finest, columns in mine for curve, weights in coarser(world, finest)]
         options += [(variables, spread(scan, base, column, basis), curve)
                     for variables, basis, curve in bases(world, v, model.joint(c.place.name).id)]
         tests += len(options)
@@ -156,10 +163,11 @@ def leftover(search, problem, fit, bare):
     return Leftover(joint, variables, curve, min(1.0, p * tests), float(gain / chi2), bool(large))
 
 
-def picked(scan, base, columns):
-    """Per window: gram and score of some columns of a scan behind those of base."""
-    pick = [*base, *columns]
-    return scan.gram[:, pick][:, :, pick], scan.score[:, pick]
+def mixed(scan, base, columns, weights):
+    """Per window: gram and score of sums of some columns of a scan, by weights (columns, k), behind those of base."""
+    pick, mix = [*base, *columns], np.eye(len(base) + len(columns), len(base) + weights.shape[1])
+    mix[len(base):, len(base):] = weights
+    return mix.T @ scan.gram[:, pick][:, :, pick] @ mix, scan.score[:, pick] @ mix
 
 
 def spread(scan, base, column, basis):
