@@ -53,7 +53,7 @@ def diagnose(model, recordings, held_out=None, progress=None):
     if not held:
         train, held = split(train)
     diagnosis = identify(world, train, held, progress=progress)
-    return dataclasses.replace(diagnosis, summary={**diagnosis.summary, "warnings": notes})
+    return dataclasses.replace(diagnosis, summary={**diagnosis.summary, "warnings": notes + diagnosis.summary["warnings"]})
 
 
 def split(recordings):

@@ -49,7 +49,7 @@ def crossed(search, fit, windows, position_noise):
         others, mine = owner != b, [w for w in windows if block(w) == b]
         if not others.any():
             continue
-        shift = scores.solve_small(scan.gram[others].sum(0), scan.score[others].sum(0))
+        shift = scores.elsewhere(scan.gram.sum(0), scan.gram[~others].sum(0), scan.score[others].sum(0))
         moved = fit.hypothesis.moved(np.clip(fit.hypothesis.vector + moves * shift, low, high)).settings
         for k, settings in enumerate(({}, moved)):
             error, _ = cut.error(search.model, mine, predict(search.world, settings, mine)[0], noise)

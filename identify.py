@@ -11,9 +11,12 @@
 Held-out recordings enter only after everything is chosen and fitted.
 """
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 
+import clock
 import events
 import evidence
 import findings
@@ -68,10 +71,13 @@ def identify(world, train, held_out, progress=None):
         hypothesis = fit.hypothesis
     if left and left.candidate not in hypothesis.candidates:
         left, hint = None, left
+    largest = max(hypothesis.candidates, key=lambda c: final.significance(fit, c)[1], default=None)
+    note = clock.suspect(final.small, fit.subset(final.few), largest)
     say(0.9, "held-out error")
     position_noise, velocity_noise = lowered_noise(world, train, position_noise, velocity_noise, hypothesis)
-    return findings.assemble(world, train, held_out, fit, final, possible, left, hint, event, ranking,
-                    position_noise, velocity_noise)
+    found = findings.assemble(world, train, held_out, fit, final, possible, left, hint, event, ranking,
+                              position_noise, velocity_noise)
+    return replace(found, summary={**found.summary, "warnings": [note] if note else []})
 
 
 def searched(data, say):
@@ -258,8 +264,13 @@ def anything_left(data, search, hypothesis):
             rest = fit.chi2.sum()
             if less.chi2.sum() < rest + min(STAND_IN * (bare.chi2.sum() - rest), 0.5 * (named - rest)):
                 fit = less
-    renamed = named_instead(selection.Search(search.world, problem, search.recordings), fit, curve)
-    return (renamed, None, None) if renamed else (fit.hypothesis, found, None)
+    local = selection.Search(search.world, problem, search.recordings)
+    local.kept = search.kept
+    renamed = named_instead(local, fit, curve)
+    if renamed:
+        return renamed, None, None
+    fit, _ = local.settle(fit, but=(curve,))  # beside the curve others may look likelier
+    return fit.hypothesis, found, None
 
 
 def named_instead(search, fit, curve):

@@ -93,6 +93,12 @@ def solve_small(gram, score):
     return np.linalg.solve(block, (score / size)[..., None])[..., 0] / size
 
 
+def elsewhere(total, gram, score):
+    """Values (..., k) that all but a part say: Gram matrix of all (k, k) and of the part (..., k, k), score (..., k) of the
+    others. Zero where the others see hardly anything."""
+    return solve_small(total - gram + LITTLE * np.diag(np.diag(total)), score)
+
+
 def sandwich(gram, score, value):
     """Covariance (k, k) of values estimated from clusters: gram (C, k, k), score (C, k), at the values (k,).
 
@@ -119,9 +125,7 @@ def wald(gram, score):
     size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     whitened = np.linalg.solve(covariance / size / size[:, None] + 1e-6 * np.eye(k), value / size)
     statistic = float(value / size @ whitened) / k * (count - k) / (count - 1)
-    # what the other clusters say; nothing of what they hardly see
-    little = LITTLE * np.einsum("ckk->k", gram)[:, None] * np.eye(k)
-    unseen = solve_small(gram.sum(0) - gram + little, score.sum(0) - score)
+    unseen = elsewhere(gram.sum(0), gram, score.sum(0) - score)
     held = 2 * (score * unseen).sum(1) - np.einsum("ck,ckl,cl->c", unseen, gram, unseen)
     return value, gain, f_survival(statistic, k, count - k), held
 

@@ -120,13 +120,15 @@ class Search(Scan):
         best = min(few, key=lambda f: f.chi2.sum())
         return shooting.solve(self.problem, [best.hypothesis], fit, iterations=4)[0]
 
-    def settle(self, fit):
+    def settle(self, fit, but=()):
         """Name every effect by the best that can stand in its place, the simplest where several do as well.
 
         Returns (fit, {candidate: [(error ratio, candidate, values), ...]}): what else is possible, best first.
         """
         possible = {}
         for candidate in fit.hypothesis.candidates:
+            if candidate in but:
+                continue
             small = fit.subset(self.few)
             others, pair = self.alternatives(fit, small, candidate)
             if pair is not None:
