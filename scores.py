@@ -105,13 +105,11 @@ def sandwich(gram, score, value):
     Small-sample factor C / (C - 1) on top of leave-one-out residual scores (CR3), which errs on the safe side.
     """
     total = gram.sum(0)
-    size = np.sqrt(np.maximum(np.diag(total), 1e-300))
-    bread = np.linalg.inv(total / size / size[:, None] + 1e-10 * np.eye(len(size))) / size / size[:, None]
     rest = score - gram @ value
     # leave-one-out change of the estimate: (total - gram_c)^-1 rest_c
     moves = solve_small(total - gram + 1e-6 * total, rest)
     count = len(gram)
-    return (count - 1) / count * moves.T @ moves + 1e-300 * bread
+    return (count - 1) / count * moves.T @ moves
 
 
 def wald(gram, score):
@@ -133,9 +131,9 @@ def wald(gram, score):
 def wald_but_one(gram, score):
     """wald, without the cluster that outweighs all others where that contradicts them: a derivative there is not to be trusted."""
     whole, total = wald(gram, score), np.maximum(np.einsum("ckk->k", gram), 1e-300)
-    share = (np.einsum("ckk->ck", gram) / total).max(1)
-    loudest = int(np.argmax(share))
-    if share[loudest] < ALONE or len(gram) < 8:
+    shares = np.einsum("ckk->ck", gram) / total
+    loudest = int(np.argmax(shares.max(1)))
+    if len(gram) < 8 or shares[loudest].max() < ALONE or shares[loudest].max() > 1 - 1e-6:  # it alone sees the effect
         return whole
     rest = wald(np.delete(gram, loudest, 0), np.delete(score, loudest, 0))
     return rest if rest[1] > whole[1] else whole

@@ -19,6 +19,7 @@ from scan import WORTH, freedom
 
 LEVEL = 0.002  # false-alarm rate, shared between all joints and variables
 SHARE, NOTABLE = 0.25, 0.05  # of the squared residual above the noise, and of the nominal model's, that a large leftover explains
+LOUD = 4.0  # squared residual of a window over the usual one
 CLUSTERS = 60  # of windows, at most
 KNOTS = 11  # of the curves that are tried, and of those with every other knot
 QUIET = 1.15  # squared residual over that of noise alone, up to which nothing large can be left
@@ -65,21 +66,38 @@ class Variables:
         self.span = float(np.median(span))
 
 
-def curves(world, problem, v, joint):
-    """Candidates of forces in a joint that are a curve of its position, its velocity or a control of its own."""
+def loud(fit, problem):
+    """Which windows (W,) hold most of what is left, if these are few; else none."""
+    each = fit.chi2 / np.maximum((problem.weight > 0).sum((1, 2)), 1)
+    out = each > LOUD * max(np.median(each), 1.0)
+    return out if 3 < out.sum() < 0.5 * len(out) else np.zeros(len(out), bool)
+
+
+def curves(world, problem, v, joint, few):
+    """Candidates of forces in a joint that are a curve of its position, its velocity or a control of its own.
+
+    few (W,): windows in which most is left; one that acts only where they lie has its knots there.
+    """
     model, name = problem.model, cut.joint_name(problem.model, joint)
     known = [cut.states(model, r) for r in {id(w.recording): w.recording for w in problem.windows}.values()]
     seen = {f"position:{name}": np.concatenate([s[0][:, model.jnt_qposadr[joint]] for s in known]),
             f"velocity:{name}": np.concatenate([s[1][:, model.jnt_dofadr[joint]] for s in known])}
     seen |= {label: u for label, u in controls(model, v, joint)}
-    return [world.curve(name, label, knots) for label, x in seen.items() if len(knots := spread_knots(x, KNOTS)) > 2]
+    out = [world.curve(name, label, knots) for label, x in seen.items() if len(knots := spread_knots(x, KNOTS)) > 2]
+    here = v.position[few, model.jnt_qposadr[joint]]
+    if few.any() and np.ptp(here) < 0.3 * np.ptp(v.position[:, model.jnt_qposadr[joint]]):
+        knots = spread_knots(here, KNOTS // 2)
+        knots = [knots[0] - 0.5 * np.ptp(knots), *knots, knots[-1] + 0.5 * np.ptp(knots)]
+        out += [world.curve(name, f"position:{name}", knots, factor=f) for f in (None, f"velocity:{name}")]
+    return out
 
 
 def coarser(world, curve):
     """(a curve, weights (k, n) of its n knots' forces in the given curve's k) of the curve itself and of one with every other knot."""
     knots, effect = np.array(curve.effect.knots), curve.effect
     some = np.unique([*knots[::2], knots[-1]])
-    return [(curve, np.eye(len(knots)))] + ([(world.curve(curve.place.name, effect.variable, some), hats(knots, some))] if len(some) > 2 else [])
+    less = world.curve(curve.place.name, effect.variable, some, effect.factor)
+    return [(curve, np.eye(len(knots)))] + ([(less, hats(knots, some))] if len(some) > 2 else [])
 
 
 def controls(model, v, joint):
@@ -128,7 +146,7 @@ def leftover(search, problem, fit, bare):
     tried, where = [{**nominal, c: (nominal.get(c, c.nominal)[0] + c.parameters[0].step,)} for c in pushes], []
     for c in pushes:
         mine = []
-        for curve in curves(world, problem, v, model.joint(c.place.name).id):
+        for curve in curves(world, problem, v, model.joint(c.place.name).id, loud(fit, problem)):
             steps = c.parameters[0].step * np.eye(len(curve.effect.knots))
             mine.append((curve, range(len(own) + len(tried), len(own) + len(tried) + len(steps))))
             tried += [{**nominal, curve: tuple(row)} for row in steps]
@@ -140,7 +158,7 @@ def leftover(search, problem, fit, bare):
         if scan.gram[:, column, column].sum() < shooting.UNSEEN:
             continue
         base = [*range(len(own)), column]
-        options = [((curve.effect.variable,), mixed(scan, base, columns, weights), curve)
+        options = [(tuple(filter(None, (curve.effect.variable, curve.effect.factor))), mixed(scan, base, columns, weights), curve)
                    for finest, columns in mine for curve, weights in coarser(world, finest)]
         options += [(variables, spread(scan, base, column, basis), curve)
                     for variables, basis, curve in bases(world, v, model.joint(c.place.name).id)]
