@@ -153,7 +153,7 @@ def lowered_noise(world, train, position, velocity, hypothesis):
     left = np.maximum(left, 1e-9)
     for dofs in cut.channels(model).values():
         left[dofs] = np.sqrt(np.mean(left[dofs] ** 2))
-    return np.minimum(position, left[:model.nv]), np.minimum(velocity, left[model.nv:])
+    return np.minimum(position, left[:model.nv]), np.minimum(velocity, left[model.nv:]) if len(left) > model.nv else velocity
 
 
 def windows_for(world, recordings, span, steps, event=None):

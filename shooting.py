@@ -20,7 +20,7 @@ UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a par
 BLOWN_UP = 1e3  # residual, in noises, of a prediction that is not finite
 GOOD = 0.5  # share of the fall of the squared residual that a Jacobian promised, from which on it is kept
 BLOCK_BYTES = 16e6  # of residuals worked out at a time
-KEPT = 12  # fits of start states that are remembered
+KEPT = 8  # fits of start states that are remembered
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,8 @@ class Problem:
             spread = np.nanmedian(np.nanstd(self.measured_qpos, axis=1), axis=0) if self.model.nq == nv else np.zeros(nv)
         position_noise = np.maximum(position_noise, 1e-3 * np.nan_to_num(spread))
         known = np.isfinite(cut.difference(self.model, self.measured_qpos, self.measured_qpos))
-        self.weight = np.concatenate([known / position_noise, np.isfinite(self.measured_qvel) / velocity_noise], -1)
+        seen = np.isfinite(self.measured_qvel)
+        self.weight = np.concatenate([known / position_noise] + ([seen / velocity_noise] if seen.any() else []), -1)  # (W, T, nv or 2 nv)
         self.weight[~np.isfinite(self.weight)] = 0.0
         self.guess_qpos, self.guess_qvel = cut.recorded_starts(self.model, self.windows)
         # Wide priors on the start states: they only decide what the measurements leave open.
@@ -140,8 +141,9 @@ class Problem:
         short = ((0, 0), (0, self.weight.shape[1] - predicted_qpos.shape[1]), (0, 0))  # these may be the shorter windows
         predicted_qpos, predicted_qvel = np.pad(predicted_qpos, short), np.pad(predicted_qvel, short)
         with np.errstate(invalid="ignore", over="ignore"):
-            gap = np.concatenate([cut.difference(self.model, predicted_qpos, self.measured_qpos[which]),
-                                  self.measured_qvel[which] - predicted_qvel], -1)
+            gap = cut.difference(self.model, predicted_qpos, self.measured_qpos[which])
+            if self.weight.shape[-1] > gap.shape[-1]:
+                gap = np.concatenate([gap, self.measured_qvel[which] - predicted_qvel], -1)
             weight = self.weight[which]
             residual = np.where(weight > 0, gap * weight, 0.0)
             blown = ~np.isfinite(residual).all((1, 2)) | (np.abs(residual).max((1, 2)) > BLOWN_UP * 100)
