@@ -147,7 +147,7 @@ class Saturation(ActuatorEffect):
 @catalogue
 class Lag(ActuatorEffect):
     """The command passes a first-order filter."""
-    name, related = 'lag', ('delay', 'back_emf')
+    name, related = 'lag', ('delay', 'back_emf', 'time_step')
 
     def fits(self, model, i):
         return super().fits(model, i) and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)

@@ -267,7 +267,8 @@ class JointStop(JointEffect):
         position, _ = self.travel(model, i, recordings)
         low, high = (p.nominal for p in self.parameters(model, i))
         a, b, c, d = np.quantile(position, [0.03, 0.15, 0.85, 0.97])
-        return np.array([(x, high) for x in (a, b) if x > low] + [(low, x) for x in (c, d) if x < high]).reshape(-1, 2)
+        both = [(x, y) for x, y in ((a, d), (b, c)) if x > low and y < high]
+        return np.array([(x, high) for x in (a, b) if x > low] + [(low, x) for x in (c, d) if x < high] + both).reshape(-1, 2)
 
     def edit(self, model, i, values):
         model.jnt_limited[i] = True

@@ -217,7 +217,7 @@ class SensorScale(SensorEffect):
 @catalogue
 class SensorDelay(SensorEffect):
     """The sensor shows what was true some time ago."""
-    name, related = 'sensor_delay', ('delay',)
+    name, related = 'sensor_delay', ('delay', 'time_step')
 
     def parameters(self, model, i):
         return Parameter('seconds', 's', 0.0, 0.0, 1.0, 0.001),

@@ -191,7 +191,9 @@ class Search(Scan):
         values = small.hypothesis.settings[candidate]
         without = small.hypothesis.minus(candidate)
         own = [{**s, candidate: values} for s in shooting.perturbed(without)[0]]
-        options = [o for o in self.options if o.candidate not in small.hypothesis.candidates and (o.linear or o in self.kept)]
+        akin = set(self.world.related(candidate))
+        options = [o for o in self.options if o.candidate not in small.hypothesis.candidates
+                   and (o.linear or o in self.kept or o.candidate in akin)]
         # absence is extrapolated from a little less, unless the effect is a limit: unstable motion is soon not linear
         nominal, less = np.array(candidate.nominal), without.settings
         finite = np.isfinite(nominal).all()
@@ -222,13 +224,17 @@ class Search(Scan):
                 singles.append((chi2, option, columns, start))
         singles.sort(key=lambda s: s[0])
         now = scan.chi2.sum()
-        hypotheses, same, seen, akin = [], [], set(), set(self.world.related(candidate))
+        hypotheses, same, seen = [], [], set()
         for chi2, option, _, start in singles:
             stands = len(seen) < 2 * most and alone - chi2 > 0.5 * (alone - now)
             if option.candidate not in seen and (stands or option.candidate in akin):
                 hypotheses.append(without.plus(option.candidate, start))
                 same.append(chi2 < now + LESS * (alone - now))
                 seen.add(option.candidate)
+        for option in options:  # of a contact's two geoms one hides the other's part, so that columns say nothing
+            if option.linear and option.candidate.effect is candidate.effect and candidate.place.kind == "geom":
+                hypotheses.append(without.plus(option.candidate, values))
+                same.append(False)
         # a first look at full size, where what is alike in a small step may differ, and the other way round
         looks = [shooting.project(self.small, f, np.zeros(f.residual.shape + (0,))).chi2.sum()
                  for f in shooting.evaluate(self.small, hypotheses, small)]
