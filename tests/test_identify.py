@@ -10,6 +10,7 @@ from hypothesis import given, settings, strategies as st
 import evidence
 import scores
 import shooting
+import unknown
 import windows as cut
 from identify import identify
 from recordings import Recording
@@ -153,6 +154,48 @@ def test_start_states_and_damping_are_recovered_without_noise():
     [fit] = shooting.solve(problem, [shooting.Hypothesis(((damping, (0.06,)),))], nominal, iterations=8)
     assert fit.hypothesis.vector[0] == pytest.approx(0.08, rel=1e-3)
     assert fit.chi2.sum() < 1e-3 * nominal.chi2.sum()
+    again = shooting.Problem(world, problem.windows, np.array([1e-4]), np.array([np.inf]))
+    assert shooting.fit_starts(again, shooting.Hypothesis()) is nominal  # remembered
+    assert shooting.fit_starts(problem.subset([0, 1]), shooting.Hypothesis()) is not nominal
+
+
+def test_updated_start_jacobians_serve_as_well_as_fresh_ones():
+    run = recorded("run.csv", 4, damping=0.2)
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    problem = shooting.Problem(world, cut.consecutive(run, 0.5), np.array([NOISE]), np.array([np.inf]))
+    fit, every = shooting.fit_starts(problem, shooting.Hypothesis()), np.arange(len(problem.windows))
+    qpos, qvel, residual = fit.qpos, fit.qvel, fit.residual
+    for _ in range(5):  # plain Gauss-Newton
+        jacobian = problem.start_jacobians([{}] * len(every), every, qpos, qvel, residual)
+        step = np.array([np.linalg.lstsq(j, r, rcond=None)[0] for j, r in zip(jacobian, residual)])
+        qpos, qvel = problem.moved(qpos, qvel, step)
+        residual = problem.residuals([{}] * len(every), every, qpos, qvel)
+    assert fit.chi2.sum() == pytest.approx((residual**2).sum(), rel=2e-3)
+    assert np.abs(fit.start_jacobian - jacobian).max() < 0.02 * np.abs(jacobian).max()
+
+
+@pytest.mark.parametrize("pieces", [1, 3])
+def test_projection_is_least_squares_on_the_start_states(pieces):
+    rng = np.random.default_rng(0)
+    problem = SimpleNamespace(weight=np.ones((4, 9, 1)), model=SimpleNamespace(nv=1))  # 9 rows and the prior's two
+    fit = SimpleNamespace(residual=rng.normal(size=(4, 11)), start_jacobian=rng.normal(size=(4, 11, 2)))
+    slope = rng.normal(size=(4, 11, 3))
+    scan = shooting.project(problem, fit, slope, pieces)
+    for w in range(4):
+        rest = lambda x: x - fit.start_jacobian[w] @ np.linalg.lstsq(fit.start_jacobian[w], x, rcond=None)[0]
+        mine = slice(w * pieces, (w + 1) * pieces)
+        assert scan.chi2[mine].sum() == pytest.approx((rest(fit.residual[w])**2).sum())
+        assert np.allclose(scan.score[mine].sum(0), rest(slope[w]).T @ rest(fit.residual[w]))
+        assert np.allclose(scan.gram[mine].sum(0), rest(slope[w]).T @ rest(slope[w]))
+
+
+def test_a_coarser_curve_is_a_sum_of_the_finer():
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    for number in (4, 5, 11):
+        finest = world.curve("pivot", "velocity:pivot", np.sort(np.random.default_rng(number).normal(size=number)))
+        x = np.linspace(-3, 3, 101)
+        for curve, weights in unknown.coarser(world, finest):
+            assert np.allclose(unknown.hats(x, finest.effect.knots) @ weights, unknown.hats(x, curve.effect.knots))
 
 
 # ---- whole diagnoses ---------------------------------------------------------------------------
