@@ -15,7 +15,8 @@ import shooting
 from scan import WORTH, Scan
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
-ODDS, DOUBT = 2.0, 8.0  # in squared residual: of an effect one level simpler; up to which few windows do not decide between two
+# in squared residual: of a parameter; of an effect one level less simple; up to which few windows do not decide between two
+PRICE, ODDS, DOUBT = 2.0, 2.0, 8.0
 FAR = 2.0  # squared residual over the noise's
 LESS = 0.03  # share of an effect, from whose absence that of the whole is extrapolated
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
@@ -68,12 +69,13 @@ class Search(Scan):
     def choose(self, fit, fits, proposals):
         """The hypothesis that wins, refitted to all windows, as (Fit, added candidates); None when none earns its keep."""
         level, before, worth = ALPHA / self.places, fit.chi2[self.few].sum(), self.worth(fit)
-        order = sorted(range(len(fits)), key=lambda i: fits[i].chi2.sum())
+        left, size = np.array([f.chi2.sum() for f in fits]), [sum(len(c.parameters) for c, _ in p) for p in proposals]
+        price = PRICE * left.min() * len(self.problem.windows) / len(self.few) / self.freedom
+        order = sorted(range(len(fits)), key=lambda i: left[i] + price * size[i])
         # a pair wins only over what the best single leaves for a second step, unless that has as many parameters
         single = next((i for i in order if len(proposals[i]) == 1), None)
         if single is not None and len(proposals[order[0]]) == 2:
-            size = [sum(len(c.parameters) for c, _ in proposals[i]) for i in (single, order[0])]
-            if size[0] < size[1] and fits[order[0]].chi2.sum() > 0.7 * fits[single].chi2.sum():
+            if size[single] < size[order[0]] and fits[order[0]].chi2.sum() > 0.7 * fits[single].chi2.sum():
                 order.remove(single)
                 order.insert(0, single)
         for i in order[:3]:
@@ -159,7 +161,7 @@ class Search(Scan):
 
     def likeliest(self, fit, rivals, most=3):
         """The likeliest of rivals [(Fit on few windows, candidate)] of equally many parameters, refitted to all windows."""
-        scale = max(fit.chi2.sum() / self.freedom, 1.0)  # what a squared residual is worth where no model reaches the noise
+        scale = fit.chi2.sum() / self.freedom  # what a squared residual is worth, whatever the noise was thought to be
         odds = lambda fits, among: [f.chi2.sum() / scale + ODDS * c.effect.simplicity for f, (_, c) in zip(fits, among)]
         few = odds([f for f, _ in rivals], rivals)
         rivals = [rivals[i] for i in np.argsort(few, kind="stable")[:most] if few[i] < min(few) + DOUBT]
@@ -229,7 +231,7 @@ class Search(Scan):
             stands = len(seen) < 2 * most and alone - chi2 > 0.5 * (alone - now)
             if option.candidate not in seen and (stands or option.candidate in akin):
                 hypotheses.append(without.plus(option.candidate, start))
-                same.append(chi2 < now + LESS * (alone - now))
+                same.append(chi2 < now + max(LESS * (alone - now), WORTH * now))
                 seen.add(option.candidate)
         for option in options:  # of a contact's two geoms one hides the other's part, so that columns say nothing
             if option.linear and option.candidate.effect is candidate.effect and candidate.place.kind == "geom":
