@@ -247,7 +247,8 @@ def anything_left(data, search, hypothesis):
         bare = shooting.fit_starts(problem, shooting.Hypothesis()) if hypothesis.effects else fit
         found = unknown.leftover(search, problem, fit, bare.chi2.sum())
         hint = hint or found
-        if found and found.large and (best is None or found.share > best[0].share):
+        notable = found and (found.large or len(hypothesis.effects) > 1 and found.share > MOST)
+        if notable and (best is None or found.share > best[0].share):
             best = found, problem, fit, bare
         if best and best[0].share > MOST:
             break
@@ -264,6 +265,8 @@ def anything_left(data, search, hypothesis):
             rest = fit.chi2.sum()
             if less.chi2.sum() < rest + min(STAND_IN * (bare.chi2.sum() - rest), 0.5 * (named - rest)):
                 fit = less
+    if not found.large and len(fit.hypothesis.effects) > 1:  # it counts only in the place of all
+        return hypothesis, None, hint
     local = selection.Search(search.world, problem, search.recordings)
     local.kept = search.kept
     renamed = named_instead(local, fit, curve)
