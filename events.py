@@ -17,6 +17,7 @@ import shooting
 LEVEL = 1e-3  # false-alarm rate, shared between all intervals and effects
 CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the interval must explain
 QUIET = 3.0  # squared residual over the noise's, of the windows without an event, above which something else is wrong
+ALONE = 0.9  # of an event's gain, the share of one window, above which that window is odd rather than an event
 LONGEST = 0.6  # of a recording: what lasts longer is no event
 
 
@@ -76,7 +77,8 @@ def find(world, problem, fit):
                     s, g = score[mine[a:b + 1]].sum(0), gram[mine[a:b + 1]].sum(0)
                     value = scores.solve_small(g, s)
                     gain = float(s @ value)
-                    if best is None or gain > best[0]:
+                    share = (2 * score[mine[a:b + 1]] @ value - np.einsum("i,wij,j->w", value, gram[mine[a:b + 1]], value)).max()
+                    if share < ALONE * gain and (best is None or gain > best[0]):
                         full = np.zeros(len(columns))
                         full[[c - columns[0] for c in keep]] = value
                         best = gain, timed, np.array(timed.nominal) + full * step, r, mine[a], mine[b], len(keep), spread

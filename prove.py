@@ -44,7 +44,7 @@ COLUMNS = ("seed", "trial", "commitment", "salt", "answer", "kind", "mechanism",
 PARAMETERS = {"mass": ("mass",), "center_of_mass": ("x", "y", "z"), "inertia": ("ixx", "iyy", "izz"),
               "stribeck_friction": ("coulomb", "static", "velocity"), "joint_stop": ("low", "high"),
               "cogging": ("amplitude", "poles", "phase"), "backlash": ("gap",), "gravity": ("x", "y", "z"),
-              "wind": ("x", "y", "z"), "external_force": ("x", "y", "z")}   # others have one
+              "wind": ("x", "y", "z"), "external_force": ("x", "y", "z"), "payload_change": ("mass",)}   # others have one
 VECTORS = ("center_of_mass", "inertia", "gravity", "wind", "external_force")
 
 
