@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import windows as cut
+from observer import observed
 
 UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a parameter counts as without effect
 BLOWN_UP = 1e3  # residual, in noises, of a prediction that is not finite
@@ -189,8 +190,10 @@ def fit_starts(problem, hypothesis, iterations=12, sharp=True):
         fit = fit_starts(problem, hypothesis, iterations, sharp=False)
         begun = jacobian(fit.qpos, fit.qvel, fit.residual)
     else:
-        qpos, qvel = problem.guess_qpos, problem.guess_qvel
-        begun = jacobian(qpos, qvel, problem.residuals(settings, every, qpos, qvel))
+        starts = (problem.guess_qpos, problem.guess_qvel), observed(problem.world, problem.windows, hypothesis.settings)
+        tried = [(*start, problem.residuals(settings, every, *start)) for start in starts]
+        better = (tried[1][2] ** 2).sum(1) < (tried[0][2] ** 2).sum(1)
+        begun = jacobian(*(np.where(better[:, None], new, old) for old, new in zip(*tried)))
     [fit] = _fit_starts(problem, [begun], 2 if sharp else iterations, fresh=True)
     if problem.key:
         kept[key] = fit

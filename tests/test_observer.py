@@ -1,0 +1,65 @@
+"""Start states against the velocities of stock MuJoCo, on a pendulum and a Hopper that are recorded too seldom."""
+
+import mujoco
+import numpy as np
+import pytest
+from diagnose import _world
+from envs import model_path
+from observer import observed
+from recordings import Recording
+from windows import consecutive, recorded_starts
+from world import World
+
+PENDULUM = """<mujoco><option timestep="0.002"/><worldbody><body><joint name="hinge" axis="0 1 0" damping="0.01"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.5" contype="0" conaffinity="0"/></body></worldbody>
+<actuator><motor joint="hinge" gear="2"/></actuator></mujoco>"""
+
+
+def recorded(model, ctrl, substeps, noise=0.0, seed=0):
+    """A Recording of stock MuJoCo's positions at every `substeps` steps, and its true velocities."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    qpos, qvel = [], []
+    for u in ctrl:
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+        data.ctrl[:] = u
+        for _ in range(substeps):
+            mujoco.mj_step(model, data)
+    qpos, qvel = np.array(qpos), np.array(qvel)
+    time = model.opt.timestep * substeps * np.arange(len(ctrl))
+    return Recording("run.csv", time, qpos + noise * rng.normal(size=qpos.shape), np.full(qvel.shape, np.nan), ctrl), qvel
+
+
+def errors(world, recording, qvel, span):
+    windows = [w for w in consecutive(recording, span) if w.first]
+    first = [w.first for w in windows]
+    rms = lambda speed: np.sqrt(np.mean((speed - qvel[first]) ** 2))
+    return rms(recorded_starts(world.model, windows)[1]), rms(observed(world, windows, {})[1]), rms(0.0)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_a_pendulum_seen_every_50_ms(noise):
+    world = World(mujoco.MjSpec.from_string(PENDULUM))
+    ctrl = np.random.default_rng(1).uniform(-1, 1, (200, 1))
+    recording, qvel = recorded(world.model, ctrl, 25, noise)
+    by_difference, by_observer, speed = errors(world, recording, qvel, 0.2)
+    assert by_observer < 0.02 * speed + 20 * noise < by_difference
+
+
+def test_a_hopper_through_contacts():
+    world = _world(model_path("Hopper-v4"))
+    ctrl = np.repeat(np.random.default_rng(2).uniform(-1, 1, (60, 3)), 2, axis=0)
+    recording, qvel = recorded(world.model, ctrl, 25)  # every 50 ms
+    by_difference, by_observer, speed = errors(world, recording, qvel, 0.2)
+    assert by_observer < 0.3 * by_difference
+
+
+def test_holes_and_measured_velocities():
+    world = World(mujoco.MjSpec.from_string(PENDULUM))
+    recording, qvel = recorded(world.model, np.random.default_rng(1).uniform(-1, 1, (100, 1)), 25)
+    windows = [w for w in consecutive(recording, 0.2) if w.first > 20]
+    recording.qpos[::3] = np.nan
+    first = [w.first for w in windows]
+    assert np.abs(observed(world, windows, {})[1] - qvel[first]).max() < 0.1 * np.abs(qvel).max()
+    recording.qvel[:] = qvel
+    np.testing.assert_allclose(observed(world, windows, {})[1], qvel[first])
