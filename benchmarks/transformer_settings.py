@@ -12,6 +12,7 @@ import argparse
 import dataclasses
 import sys
 import time
+import types
 from pathlib import Path
 
 import torch
@@ -61,7 +62,7 @@ def main():
             continue
         sim, real = BatchEnv(s.env, s.num_envs, nthread=1), BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=1)
         learner = train.new_learner(s)
-        learner.load(train.pretrained(s, "sim", sim, Quiet()))
+        learner.load(train.pretrained(s, "sim", sim, s.pretrain_steps, Quiet()))
         tau_real = rollouts(learner.policy, real, s.real_trajectories, seed + 1)[1]
         held_out = rollouts(learner.policy, real, s.eval_episodes, seed + 1000)[1]
         for v in todo:
@@ -92,7 +93,7 @@ def ground(s, v, sim, real, policy, tau_real, seed):
 class Quiet:
     """The part of train.Bar that train.pretrained needs, silent."""
 
-    world = "sim"
+    world, run = "sim", types.SimpleNamespace(train=[], flush=lambda: None)
 
     def phase(self, step, name):
         return None
