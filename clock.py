@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+import misfit
 import shooting
 
 WIDEST, STEPS = 0.06, 6  # of the clock's error; steps of the search, each of which halves what is left
@@ -20,7 +21,7 @@ def suspect(problem, fit, largest):
     """One line that says how wrong the clock seems, where another clock and the largest finding explain what all do."""
     if sum(c.effect.name != "time_step" for c in fit.hypothesis.candidates) < MANY:
         return None
-    alone = shooting.Hypothesis(((largest, fit.hypothesis.settings[largest]),))
+    alone = misfit.Hypothesis(((largest, fit.hypothesis.settings[largest]),))
     bare = before = left(problem, 1.0, alone)
     ratio, reach = 1.0, WIDEST / 2
     for _ in range(STEPS):

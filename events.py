@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+import misfit
 import scores
 import shooting
 
@@ -28,7 +29,7 @@ class Event:
     recording: object
     time: tuple  # (from, to), s
     p_value: float
-    fit: object = None  # shooting.Fit on the windows around it
+    fit: object = None  # misfit.Fit on the windows around it
     problem: object = None
     left: float = 0.0  # squared residual of all windows with it
     others: list = field(default_factory=list)  # [(candidate, values)] that explain it as well
@@ -52,7 +53,7 @@ def find(world, problem, fit):
         return None
     settings, where, moves = [], [], []
     for steady, _ in pairs:
-        moved, step = shooting.perturbed(shooting.Hypothesis(((steady, steady.nominal),)))
+        moved, step = shooting.perturbed(misfit.Hypothesis(((steady, steady.nominal),)))
         where.append(range(len(settings), len(settings) + len(step)))
         settings += [{**fit.hypothesis.settings, steady: m[steady]} for m in moved]
         moves.append(step)

@@ -8,6 +8,7 @@ The error is the contract's (windows.error): consecutive windows, start as recor
 
 import numpy as np
 
+import misfit
 import scores
 import shooting
 import windows as cut
@@ -81,8 +82,8 @@ def floor_gaps(world, settings, recordings, position_noise, velocity_noise, hori
     early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
     ends = [int(np.searchsorted(w.recording.time, w.recording.time[w.first] + cut.HORIZON * (1 + 1e-6), "right")) - 1 for w in windows]
     begun = [w._replace(last=max(min(w.last, end), w.first + 1)) for w, end in zip(early, ends)]
-    problem = shooting.Problem(world, begun, position_noise, velocity_noise)
-    fit = shooting.fit_starts(problem, shooting.Hypothesis(tuple(settings.items())), sharp=False)
+    problem = misfit.Problem(world, begun, position_noise, velocity_noise)
+    fit = shooting.fit_starts(problem, misfit.Hypothesis(tuple(settings.items())), sharp=False)
     truth, speed = predict(world, settings, early, (fit.qpos, fit.qvel))
     finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
     noisy = cut.integrate(model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,)))

@@ -20,6 +20,7 @@ import clock
 import events
 import evidence
 import findings
+import misfit
 import selection
 import shooting
 import unknown
@@ -60,7 +61,7 @@ def identify(world, train, held_out, progress=None):
     hypothesis = fit.hypothesis
     say(0.75, "testing for anything left")
     hypothesis, left, hint = anything_left(data, search, hypothesis)
-    hypothesis = shooting.Hypothesis(tuple((c, c.effect.canonical(values)) for c, values in hypothesis.effects))
+    hypothesis = misfit.Hypothesis(tuple((c, c.effect.canonical(values)) for c, values in hypothesis.effects))
     say(0.8, "intervals")
     problem, fit = bounded(problem_of(*data, span, FINAL_STEPS), hypothesis)
     final = selection.Search(world, problem, train)
@@ -86,7 +87,7 @@ def searched(data, say):
     Where the first leaves much unfound, windows were too long for that: motion far off is soon not linear.
     """
     world, train = data[:2]
-    hypothesis, ranking, span = shooting.Hypothesis(), [], 0.0
+    hypothesis, ranking, span = misfit.Hypothesis(), [], 0.0
     for i in range(ROUNDS):
         say(0.05 + 0.15 * i, "choosing windows")
         longer = span_for(*data, hypothesis, at_least=span)
@@ -137,7 +138,7 @@ def noise_of(world, train):
     if not np.isfinite(position).any() and not np.isfinite(velocity).any():
         raise RecordingError("not enough data: recordings need at least ten measured rows in some qpos column")
     for _ in range(2):
-        position, velocity = lowered_noise(world, train, position, velocity, shooting.Hypothesis())
+        position, velocity = lowered_noise(world, train, position, velocity, misfit.Hypothesis())
     return position, velocity
 
 
@@ -175,7 +176,7 @@ def dear(model):
 
 
 def problem_of(world, recordings, position_noise, velocity_noise, event, span, steps):
-    return shooting.Problem(world, windows_for(world, recordings, span, steps, event), position_noise, velocity_noise)
+    return misfit.Problem(world, windows_for(world, recordings, span, steps, event), position_noise, velocity_noise)
 
 
 def follows(problem, fit, share_allowed):
@@ -224,7 +225,7 @@ def happened(data, hypothesis):
     """What came and went for a while, beside what lasts or instead of it: an Event, if it leaves less; else None."""
     problem = problem_of(*data, LEFTOVER_SPANS[0], FINAL_STEPS)
     lasting, found = shooting.fit_starts(problem, hypothesis), []
-    for h in {hypothesis, shooting.Hypothesis()}:
+    for h in dict.fromkeys((hypothesis, misfit.Hypothesis())):
         event = events.find(data[0], problem, lasting if h == hypothesis else shooting.fit_starts(problem, h))
         if event and event.left < (1 - STAND_IN) * lasting.chi2.sum():
             found.append(event)
@@ -244,7 +245,7 @@ def anything_left(data, search, hypothesis):
         fit = shooting.fit_starts(problem, hypothesis)
         if unknown.quiet(problem, fit):
             continue
-        bare = shooting.fit_starts(problem, shooting.Hypothesis()) if hypothesis.effects else fit
+        bare = shooting.fit_starts(problem, misfit.Hypothesis()) if hypothesis.effects else fit
         found = unknown.leftover(search, problem, fit, bare.chi2.sum())
         hint = hint or found
         notable = found and (found.large or len(hypothesis.effects) > 1 and found.share > MOST)
@@ -258,7 +259,7 @@ def anything_left(data, search, hypothesis):
     curve, named = found.candidate, fit.chi2.sum()
     [fit] = shooting.solve(problem, [hypothesis.plus(curve, curve.nominal)], fit)
     for gone in [hypothesis.candidates] + [(c,) for c in hypothesis.candidates]:
-        shorter = shooting.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in gone))
+        shorter = misfit.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in gone))
         if len(shorter.effects) < len(fit.hypothesis.effects):
             shorter = shorter.plus(curve, curve.nominal)
             [less] = shooting.solve(problem, [shorter], bare if len(shorter.effects) == 1 else fit)

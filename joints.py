@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from effects import (BALL, HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Candidate, Effect, Parameter, Place, angle, catalogue,
-                     constant_force, passive, runge_kutta, turns)
+from effects import (BALL, HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Effect, Parameter, angle, catalogue, constant_force, passive,
+                     runge_kutta, turns)
 
 # frictionloss as a nearly rigid constraint: with MuJoCo's default a stuck joint creeps
 SOLREF_FRICTION = (0.004, 1.0)
@@ -323,86 +323,3 @@ class Backlash(JointEffect):
     def write(self, spec, model, i, values):
         self.build(spec, model, i).range = [angle(spec, model, i, x) for x in (-values[0] / 2, values[0] / 2)]
         return 'mjcf'
-
-
-class Unknown(JointEffect):
-    """A force in the joint that is some curve of one variable: its values at knots, linear between, flat beyond.
-
-    variable: 'position:<joint>', 'velocity:<joint>', 'control:<actuator>' or 'time'. factor: None, or what the curve is
-    multiplied by: 'control:<actuator>', or 'velocity:<joint>' for its sign. wave: a sine through two knots, a quarter
-    of its period apart.
-    """
-    name, kind, simplicity = 'unknown', 'joint', 3
-
-    def __init__(self, variable, knots, factor=None, wave=False):
-        self.variable, self.knots, self.factor, self.wave = variable, tuple(float(x) for x in knots), factor, wave
-
-    def _key(self):
-        return self.variable, self.knots, self.factor, self.wave
-
-    def __eq__(self, other):
-        return isinstance(other, Unknown) and self._key() == other._key()
-
-    def __hash__(self):
-        return hash(self._key())
-
-    def parameters(self, model, i):
-        M = self.scale(model, i)
-        force = self.unit(model, i, 'N·m', 'N')
-        return tuple(Parameter(f'force {k}', force, 0.0, -HUGE * M, HUGE * M, 0.05 * M) for k in range(len(self.knots)))
-
-    def force(self, models, i, values):
-        model, knots = models[0], np.array(self.knots)
-        d, rows = model.jnt_dofadr[i], np.arange(len(values))
-
-        def read(variable, qpos, qvel, ctrl, time):
-            kind, _, name = variable.partition(':')
-            if kind == 'time':
-                return time
-            if kind == 'control':
-                return ctrl[:, model.actuator_ctrladr[model.actuator(name).id]]
-            joint = model.joint(name)
-            return qpos[:, joint.qposadr[0]] if kind == 'position' else qvel[:, joint.dofadr[0]]
-
-        def curve(*state):
-            x, out = read(self.variable, *state), np.zeros_like(state[1])
-            if self.wave:
-                turn = np.pi / 2 * (x - knots[0]) / (knots[1] - knots[0])
-                out[:, d] = values[:, 0] * np.cos(turn) + values[:, 1] * np.sin(turn)
-            else:
-                k = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
-                f = np.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0)
-                out[:, d] = (1 - f) * values[rows, k] + f * values[rows, k + 1]
-            if self.factor:
-                y = read(self.factor, *state)
-                out[:, d] *= np.sign(y) if self.factor.startswith('velocity') else y
-            return out
-        return curve
-
-    def write(self, spec, model, i, values):
-        """As a constant and a cubic in the joint's own position or velocity, if that is within 5 % of the curve."""
-        joint = spec.joint(model.joint(i).name)
-        x, y = np.array(self.knots), np.array(values)
-        if self.factor or self.wave:
-            return 'none'
-        if self.variable == f'velocity:{joint.name}':
-            powers, field = [x, x * abs(x), x**3], joint.damping
-        elif self.variable == f'position:{joint.name}':
-            shift = x - model.qpos_spring[model.jnt_qposadr[i]]
-            powers, field = [shift, shift**2, shift**3], joint.stiffness
-        else:
-            return 'none'
-        basis = np.stack([np.ones_like(x), *powers], axis=1)
-        size = abs(basis).max(axis=0)
-        fit = np.linalg.lstsq(basis / size, y, rcond=None)[0] / size
-        if abs(basis @ fit - y).max() > 0.05 * np.ptp(y):
-            return 'none'
-        field[:] = np.array(field) - fit[1:]
-        constant_force(spec, f'unknown:{joint.name}', fit[0], JOINT_TRANSMISSION, joint.name)
-        return 'mjcf'
-
-
-def curve(model, joint, variable, knots, factor=None, wave=False):
-    """Candidate for an unknown force in a joint: see Unknown. Parameters: the force at each knot."""
-    effect = Unknown(variable, knots, factor, wave)
-    return Candidate(effect, Place('joint', joint), effect.parameters(model, model.joint(joint).id))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+import misfit
 import scores
 import shooting
 
@@ -70,7 +71,7 @@ def options_of(world, recordings):
         if candidate.effect.overrides("probes"):
             out += [Option(candidate, (tuple(float(v) for v in row),), False) for row in world.probes(candidate, recordings)]
         else:
-            moved = shooting.perturbed(shooting.Hypothesis(((candidate, candidate.nominal),)))[0]
+            moved = shooting.perturbed(misfit.Hypothesis(((candidate, candidate.nominal),)))[0]
             out.append(Option(candidate, tuple(m[candidate] for m in moved), True))
             # far from its nominal a mass does not act in proportion; friction that sticks has no gradient at all
             factors = {"mass": (4.0, 20.0), "contact_friction": (0.5, 0.2)}.get(candidate.effect.name, ())

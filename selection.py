@@ -1,7 +1,7 @@
 """Which effects? Scan all candidates, refit the best few (alone and in pairs), keep, drop, swap, until nothing earns its keep.
 
     search = Search(world, problem, recordings)
-    fit = search.run(fit)               # shooting.Fit of the chosen hypothesis
+    fit = search.run(fit)               # misfit.Fit of the chosen hypothesis
     fit, possible = search.settle(fit)  # the simplest of equals; what else could stand in each effect's place
 
 An effect is added when its gain is significant after correction for the number of candidates (clusters of windows,

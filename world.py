@@ -16,7 +16,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-import joints
+import curves
 from engine import Engine
 from physics import EFFECTS, Candidate, Place
 from signals import SLACK
@@ -95,8 +95,8 @@ class World:
 
     def curve(self, joint, variable, knots, factor=None, wave=False):
         """Candidate `unknown`: a force in a joint as a curve of 'position:<joint>', 'velocity:<joint>',
-        'control:<actuator>' or 'time', linear between knots; its parameters are the forces at the knots. See joints.Unknown."""
-        return joints.curve(self.model, joint, variable, knots, factor, wave)
+        'control:<actuator>' or 'time', linear between knots; its parameters are the forces at the knots. See curves.Unknown."""
+        return curves.curve(self.model, joint, variable, knots, factor, wave)
 
     def localised(self, candidate, when):
         """The same candidate acting only under a condition (see Candidate.when)."""

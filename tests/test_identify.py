@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import evidence
+import misfit
 import scores
 import shooting
 import unknown
@@ -148,22 +149,22 @@ def test_p_values_hold_under_correlated_residuals():
 def test_start_states_and_damping_are_recovered_without_noise():
     run = recorded("run.csv", 2, damping=0.08, noise=0.0)
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
-    problem = shooting.Problem(world, cut.consecutive(run, 0.5), np.array([1e-4]), np.array([np.inf]))
-    nominal = shooting.fit_starts(problem, shooting.Hypothesis())
+    problem = misfit.Problem(world, cut.consecutive(run, 0.5), np.array([1e-4]), np.array([np.inf]))
+    nominal = shooting.fit_starts(problem, misfit.Hypothesis())
     damping = world.candidate("viscous_damping", "pivot")
-    [fit] = shooting.solve(problem, [shooting.Hypothesis(((damping, (0.06,)),))], nominal, iterations=8)
+    [fit] = shooting.solve(problem, [misfit.Hypothesis(((damping, (0.06,)),))], nominal, iterations=8)
     assert fit.hypothesis.vector[0] == pytest.approx(0.08, rel=1e-3)
     assert fit.chi2.sum() < 1e-3 * nominal.chi2.sum()
-    again = shooting.Problem(world, problem.windows, np.array([1e-4]), np.array([np.inf]))
-    assert shooting.fit_starts(again, shooting.Hypothesis()) is nominal  # remembered
-    assert shooting.fit_starts(problem.subset([0, 1]), shooting.Hypothesis()) is not nominal
+    again = misfit.Problem(world, problem.windows, np.array([1e-4]), np.array([np.inf]))
+    assert shooting.fit_starts(again, misfit.Hypothesis()) is nominal  # remembered
+    assert shooting.fit_starts(problem.subset([0, 1]), misfit.Hypothesis()) is not nominal
 
 
 def test_updated_start_jacobians_serve_as_well_as_fresh_ones():
     run = recorded("run.csv", 4, damping=0.2)
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
-    problem = shooting.Problem(world, cut.consecutive(run, 0.5), np.array([NOISE]), np.array([np.inf]))
-    fit, every = shooting.fit_starts(problem, shooting.Hypothesis()), np.arange(len(problem.windows))
+    problem = misfit.Problem(world, cut.consecutive(run, 0.5), np.array([NOISE]), np.array([np.inf]))
+    fit, every = shooting.fit_starts(problem, misfit.Hypothesis()), np.arange(len(problem.windows))
     qpos, qvel, residual = fit.qpos, fit.qvel, fit.residual
     for _ in range(5):  # plain Gauss-Newton
         jacobian = problem.start_jacobians([{}] * len(every), every, qpos, qvel, residual)

@@ -18,7 +18,7 @@ sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import drawing
 import experiments
 import figures
-import joints
+import curves
 import leftover
 import motion
 import report
@@ -65,7 +65,7 @@ def diagnosis():
                                     for k, f in enumerate(force)]})
     return types.SimpleNamespace(
         summary=summary, corrected_xml=ARM.replace('range="-2.9', 'frictionloss="0.12" range="-2.9'), world=types.SimpleNamespace(model=arm()),
-        settings={joints.curve(arm(), "shoulder", "position:elbow", knots): force}, ranking=ranking, traces=traces,
+        settings={curves.curve(arm(), "shoulder", "position:elbow", knots): force}, ranking=ranking, traces=traces,
         train=train, held_out=held)
 
 
