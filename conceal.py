@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from hidden import Real
-from mechanisms import MECHANISMS, SENSOR_EFFECTS, UNKNOWNS
+from mechanisms import MECHANISMS, UNKNOWNS
 
 DEVELOPMENT_SEEDS = range(1, 1000)                   # for looking at, and improving the method on
 FINAL_SEED = 20270              # of the published table: run once, when the method stands still

@@ -31,7 +31,8 @@ def smooth(model, recording, most, seconds=HALF):
         qpos = recording.qpos[centre].copy()
         mujoco.mj_integratePos(model, qpos, here, 1.0)
         found.append((time[centre], qpos, speed, acceleration, recording.ctrl[near.start:near.stop - 1].mean(axis=0)))
-    return [np.array(x) for x in zip(*found)] if found else [np.empty(0)] + [np.empty((0, 0))] * 4
+    widths = (), (model.nq,), (model.nv,), (model.nv,), (model.nu,)
+    return [np.array([row[k] for row in found]).reshape(len(found), *width) for k, width in enumerate(widths)]
 
 
 def forces(model, qpos, qvel, qacc, ctrl):

@@ -310,7 +310,7 @@ def _columns(path, arrays, model):
 # --- Minari ---------------------------------------------------------------------------------------------------------
 
 def _minari(path, model):
-    """One Recording per episode of a Minari dataset, given by id or by folder."""
+    """What `read` returns, one for each episode of a Minari dataset, given by id or by folder."""
     if not os.path.exists(path) and "/" not in path and "-v" not in path:
         raise RecordingError(f"{path}: no such file; check the path")
     for pattern in ("*.csv", "*.npz"):

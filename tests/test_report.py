@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 import types
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import mujoco
@@ -290,6 +291,19 @@ def test_leftover_force_is_the_one_that_was_left_out():
     missing = leftover.forces(made(0.0), qpos, qvel, qacc, ctrl)
     np.testing.assert_allclose(missing, -0.3 * qvel, atol=0.05)
     assert np.abs(leftover.forces(truth, qpos, qvel, qacc, ctrl)).max() < 0.05 < 0.3 * np.abs(qvel).max() / 5
+
+
+def test_recordings_too_short_to_smooth_add_nothing(diagnosis):
+    """Beside good ones, one of a few rows and one full of holes: no rows, of the same widths, and the page comes out."""
+    [good], model = diagnosis.held_out, arm()
+    short = replace(good, name="short.csv", time=good.time[:5], qpos=good.qpos[:5], qvel=good.qvel[:5], ctrl=good.ctrl[:5])
+    holed = replace(good, name="holed.csv", qpos=np.where(np.arange(len(good.time))[:, None] % 3, good.qpos, np.nan))
+    for poor in (short, holed):
+        assert [x.shape for x in leftover.smooth(model, poor, 100)] == [(0,), (0, 2), (0, 2), (0, 2), (0, 2)]
+    alone = leftover.residuals(diagnosis, 300)
+    diagnosis.held_out = [short, good, holed]
+    assert [len(r["x"]) for r in leftover.residuals(diagnosis, 900 - 3)] == [len(r["x"]) for r in alone] and alone
+    assert "force left at elbow" in report.html_page(diagnosis)
 
 
 def test_every_pair_of_rivals_has_an_experiment():
