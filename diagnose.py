@@ -7,7 +7,7 @@
     diagnosis.summary["findings"]
 
 Writes report.html (to look at), diagnosis.json (to compute with) and corrected.xml (to simulate with). Exit status: 0 a
-diagnosis was made, whatever it says; 2 bad input or not enough data, with one line on stderr.
+diagnosis was made, whatever it says; 2 bad input or not enough data, 1 a fault of this program, with one line on stderr.
 """
 import argparse
 import dataclasses
@@ -57,20 +57,23 @@ def diagnose(model, recordings, held_out=None, progress=None):
 
 
 def split(recordings):
-    """(for fitting, held out): every third recording is kept back, or the last 30 % of each of one or two."""
+    """(for fitting, held out): every third recording is kept back, or the last 30 % of each of one or two.
+
+    Such a last part keeps the rows before its `start`: actuator states and delayed controls run on from them.
+    """
     if len(recordings) >= 3:
         return [r for i, r in enumerate(recordings) if i % 3 != 2], [r for i, r in enumerate(recordings) if i % 3 == 2]
     parts = []
     for recording in recordings:
         cut = int(np.searchsorted(recording.time, recording.time[0] + 0.7 * np.ptp(recording.time)))
-        for rows in (slice(None, cut), slice(cut, None)):
-            if len(recording.time[rows]) < 10:
-                raise recorded.RecordingError(
-                    f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} rows; record again, longer "
-                    f"({recorded.ENOUGH}), or give --held-out")
-            parts.append(dataclasses.replace(
-                recording, time=recording.time[rows], qpos=recording.qpos[rows], qvel=recording.qvel[rows],
-                ctrl=recording.ctrl[rows], sensors={name: values[rows] for name, values in recording.sensors.items()}))
+        if min(cut, len(recording.time) - cut) < 10:
+            raise recorded.RecordingError(
+                f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} rows; record again, longer "
+                f"({recorded.ENOUGH}), or give --held-out")
+        early = dataclasses.replace(
+            recording, time=recording.time[:cut], qpos=recording.qpos[:cut], qvel=recording.qvel[:cut],
+            ctrl=recording.ctrl[:cut], sensors={name: values[:cut] for name, values in recording.sensors.items()})
+        parts += [early, dataclasses.replace(recording, start=cut)]
     return parts[::2], parts[1::2]
 
 
@@ -101,15 +104,20 @@ def _recordings(recordings, held_out, model):
     given, more = ([x] if isinstance(x, one) else list(x or []) for x in (recordings, held_out))
     if not given:
         raise recorded.RecordingError("no recordings given: name at least one CSV or NPZ file")
-    if any(isinstance(x, recorded.Recording) for x in given + more):
-        return given, more
-    where = [os.path.realpath(path) for path in given]
-    for path in more:
+    files, further = ([x for x in some if not isinstance(x, recorded.Recording)] for some in (given, more))
+    where = [os.path.realpath(path) for path in files]
+    for path in further:
         if os.path.realpath(path) in where:
             raise recorded.RecordingError(f"{path}: given both for fitting and as held out; give it once")
-    train, held = recorded.load(given, model), recorded.load(more, model) if more else []
+    train, held = (_loaded(some, paths, model) for some, paths in ((given, files), (more, further)))
     taken = {recording.name for recording in train}
     return train, [dataclasses.replace(r, name=f"held out {r.name}") if r.name in taken else r for r in held]
+
+
+def _loaded(given, paths, model):
+    """What was given as Recording objects, from files what was given as paths: those first."""
+    read = recorded.load(paths, model) if paths else []
+    return read + [recorded.accepted(x, model) for x in given if isinstance(x, recorded.Recording)]
 
 
 def _runs(model, recordings):
@@ -146,7 +154,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(argv=None):
-    """The command. Returns the exit status: 0, or 2 with one line on stderr."""
+    """The command. Returns the exit status: 0, or 2 or 1 with one line on stderr."""
     parser = _Parser(prog="diagnose.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     nominal = parser.add_mutually_exclusive_group(required=True)
     nominal.add_argument("--model", help="MJCF file of the nominal simulator")
@@ -185,9 +193,9 @@ def main(argv=None):
             bar.close()
         place = traceback.extract_tb(error.__traceback__)[-1]
         print(f"diagnose.py: a fault of this program, not of its input: {type(error).__name__} in "
-              f"{os.path.basename(place.filename)}, line {place.lineno} ({' '.join(str(error).split())}); please report it",
-              file=sys.stderr)
-        return 2
+              f"{os.path.basename(place.filename)}, line {place.lineno} ({' '.join(str(error).split())}); please report this line, "
+              "with the model and recordings if they may be shown", file=sys.stderr)
+        return 1
     if bar:
         bar.close()
     sys.stdout.reconfigure(errors="replace")  # a terminal that cannot show ± or ∞ still shows the rest

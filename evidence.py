@@ -21,7 +21,7 @@ def predict(world, settings, windows, starts=None):
 
 
 def consecutive(recordings, horizon):
-    return [w for r in recordings for w in cut.consecutive(r, horizon)]
+    return [w for r in recordings for w in cut.consecutive(r, horizon, r.start)]
 
 
 def prediction_error(world, settings, recordings, noise, horizon=cut.HORIZON):
@@ -131,7 +131,7 @@ def traces(world, settings, recordings, horizon=cut.HORIZON, most=3):
     """[{recording, channel, time, measured, nominal, corrected}] of held-out data; predictions break (NaN) at window starts."""
     out, model = [], world.model
     for recording in recordings[:most]:
-        windows = cut.consecutive(recording, horizon)
+        windows = cut.consecutive(recording, horizon, recording.start)
         lines = [_stitched(predict(world, s, windows)[0], windows) for s in ({}, settings)]
         rows = np.concatenate([np.arange(w.first, w.last + 1) for w in windows])
         for j, _, q, _ in cut.joint_slices(model):

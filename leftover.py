@@ -52,7 +52,7 @@ def residuals(diagnosis, most=1200):
     """One dict per finding that can be drawn: finding (index), variable, x, before, after (n,), unit, x_unit."""
     nominal = diagnosis.world.model
     corrected = mujoco.MjModel.from_xml_string(diagnosis.corrected_xml)
-    measured = [r for r in diagnosis.held_out if not np.isnan(r.qpos).all(axis=0).any()]
+    measured = [r.seen() for r in diagnosis.held_out if not np.isnan(r.qpos).all(axis=0).any()]
     if nominal.na or not measured:
         return []
     time, *states = (np.concatenate(x) for x in zip(*(smooth(nominal, r, most // len(measured) + 1) for r in measured)))

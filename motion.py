@@ -7,7 +7,7 @@ FRAMES, SECONDS = 60, 2.0
 
 def poses(model, recordings, count=4):
     """[(nq,)] recorded poses, evenly spread over the longest recording; unmeasured joints stay at their reference."""
-    longest = max(recordings, key=lambda recording: len(recording.time))
+    longest = max((r.seen() for r in recordings), key=lambda recording: len(recording.time))
     rows = np.linspace(0.5, 0.98, count) * (len(longest.time) - 1)
     return [whole(model, longest.qpos[int(row)]) for row in rows]
 
@@ -68,7 +68,7 @@ def overlay(diagnosis):
     corrected = mujoco.MjModel.from_xml_string(diagnosis.corrected_xml)
     models = {"nominal": (nominal, columns_in(nominal, nominal)), "corrected": (corrected, columns_in(corrected, nominal))}
     worst = None
-    for recording in diagnosis.held_out[:8]:
+    for recording in (r.seen() for r in diagnosis.held_out[:8]):
         end = np.searchsorted(recording.time, recording.time[-1] - min(SECONDS, 0.9 * np.ptp(recording.time)))
         for first in sorted({int(k) for k in np.linspace(0, end, 6)}):
             last = int(np.searchsorted(recording.time, recording.time[first] + SECONDS, side="right")) - 1

@@ -261,10 +261,10 @@ def _npz(path, data, model):
             SyntaxError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
         raise RecordingError(f"{path}: not a readable NPZ file ({type(error).__name__}); save it again with "
                              "numpy.savez") from None
-    return _columns(path, arrays, model)
+    return by_column(path, arrays, model)
 
 
-def _columns(path, arrays, model):
+def by_column(path, arrays, model):
     """Whole arrays (time, qpos, qvel, ctrl, sensor:<name>) to {column name: (T,)}; raises RecordingError on widths."""
     known = columns_of(model)
     widths = {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu}
@@ -337,7 +337,7 @@ def _minari(path, model):
                              "files") from None
     name = os.path.basename(os.path.normpath(path))
     return [(f"{path} episode {episode.id}", f"{name}:{episode.id}",
-             _columns(path, _episode(path, episode, model, dt), model), 0) for episode in episodes]
+             by_column(path, _episode(path, episode, model, dt), model), 0) for episode in episodes]
 
 
 def _episode(path, episode, model, dt):

@@ -12,12 +12,12 @@ A Minari dataset (id or folder) gives one recording per episode. Units are SI: s
 Row t is the state at time[t] and the control held from time[t] to time[t+1]. NaN, or an empty cell, is "not measured".
 """
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
 
-from readers import WIDTHS, RecordingError, columns_of, read
+from readers import WIDTHS, RecordingError, by_column, columns_of, read
 from units import suspect
 
 LARGEST = {"time": 1e300, "qpos": 1e6, "qvel": 1e6, "ctrl": 1e9, "sensor": 1e12}  # beyond these no unit explains a value
@@ -28,7 +28,8 @@ class Recording:
     """One continuous run. NaN: not measured. Columns stand in MuJoCo's order.
 
     name: file name; time (T,) s, increasing; qpos (T, nq) m or rad; qvel (T, nv), all NaN when absent;
-    ctrl (T, nu), without NaN; sensors: name -> (T, k).
+    ctrl (T, nu), without NaN; sensors: name -> (T, k). start: the row from which on it is predicted where it is held out;
+    those before only say what led there, such as controls that are still on their way.
     """
     name: str
     time: np.ndarray
@@ -36,6 +37,13 @@ class Recording:
     qvel: np.ndarray
     ctrl: np.ndarray
     sensors: dict = field(default_factory=dict)
+    start: int = 0
+
+    def seen(self):
+        """The rows from `start` on, as a Recording of their own."""
+        rows = slice(self.start, None)
+        return replace(self, time=self.time[rows], qpos=self.qpos[rows], qvel=self.qvel[rows], ctrl=self.ctrl[rows],
+                       sensors={name: values[rows] for name, values in self.sensors.items()}, start=0)
 
 
 def load(paths, model):
@@ -60,6 +68,19 @@ def load(paths, model):
                 name = os.path.join(os.path.basename(os.path.dirname(where)), name)
             recordings.append(_recording(label, name, columns, model, first_row))
     return recordings
+
+
+def accepted(recording, model):
+    """A Recording that somebody made in Python, as `load` would have made it. Raises RecordingError as `load` does; rows
+    are counted from 0."""
+    arrays = {"time": recording.time, "qpos": recording.qpos, "qvel": recording.qvel, "ctrl": recording.ctrl}
+    arrays |= {f"sensor:{name}": values for name, values in recording.sensors.items()}
+    columns = by_column(recording.name, {key: np.asarray(values) for key, values in arrays.items()}, model)
+    made = _recording(recording.name, recording.name, columns, model, 0)
+    if not 0 <= recording.start < len(made.time) - 1:
+        raise RecordingError(f"{recording.name}: start is row {recording.start} of {len(made.time)}; at least two rows have to "
+                             "follow it")
+    return replace(made, start=recording.start)
 
 
 def _recording(path, name, columns, model, first_row):

@@ -315,5 +315,5 @@ def _about(diagnosis):
 
 
 def _names(recordings, most=12):
-    names = list(dict.fromkeys(recording.name for recording in recordings))
+    names = list(dict.fromkeys(r.name + (f" from {wording.number(r.time[r.start])} s on" if r.start else "") for r in recordings))
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,4 +1,5 @@
 """The command: what it refuses and how, how it splits, what it says, and that a diagnosis comes out."""
+import dataclasses
 import json
 import os
 import subprocess
@@ -11,9 +12,11 @@ import pytest
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 import diagnose
+import evidence
 import wording
 from recordings import Recording, RecordingError
 from tests.malformed import ARM, cases, run, text
+from world import World
 
 CASES = cases()
 
@@ -60,10 +63,63 @@ def test_split_keeps_back_every_third_or_the_last_part():
     train, held = diagnose.split(many)
     assert [r.name for r in train] == ["0", "1", "3", "4", "6"] and [r.name for r in held] == ["2", "5"]
     train, held = diagnose.split(many[:1])
-    assert len(train[0].time) + len(held[0].time) == 50 and 14 <= len(held[0].time) <= 16
-    assert held[0].time[0] > train[0].time[-1]
+    assert len(train[0].time) + len(held[0].seen().time) == 50 and 14 <= len(held[0].seen().time) <= 16
+    assert held[0].seen().time[0] > train[0].time[-1]
+    np.testing.assert_array_equal(held[0].time, many[0].time)  # what led there stays
     train, held = diagnose.split(many[:2])
     assert [r.name for r in train] == ["0", "1"] == [r.name for r in held]
+
+
+INTEGRATOR = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint name="j" axis="0 1 0" damping="0.3"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><intvelocity name="drive" joint="j" kp="20" actrange="-2 2"/></actuator></mujoco>"""
+
+
+def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
+    """A servo that integrates its control: stock MuJoCo's record of the nominal model itself, without noise. Its target at
+    the cut is that of the rows before, so the nominal model predicts the tail; from a target of 0 it misses by far."""
+    model = mujoco.MjModel.from_xml_string(INTEGRATOR)
+    data, rows = mujoco.MjData(model), []
+    for _ in range(300):
+        rows.append([data.time, data.qpos[0], data.qvel[0], 0.8 + np.sin(3 * data.time)])
+        data.ctrl[0] = rows[-1][3]
+        mujoco.mj_step(model, data, nstep=5)
+    rows = np.array(rows)
+    whole = Recording("run.csv", rows[:, 0], rows[:, 1:2], rows[:, 2:3], rows[:, 3:])
+    [early], [tail] = diagnose.split([whole])
+    world = World(mujoco.MjSpec.from_string(INTEGRATOR))
+    error, _ = evidence.prediction_error(world, {}, [tail], np.ones(1))
+    assert error < 1e-6 and len(evidence.consecutive([tail], 0.3)) == 2
+    assert evidence.prediction_error(world, {}, [tail.seen()], np.ones(1))[0] > 0.1
+    trace, = evidence.traces(world, {}, [tail])
+    assert trace["time"][0] == tail.time[tail.start] > early.time[-1]
+
+
+@pytest.mark.parametrize("change, says", [
+    ({"ctrl": np.full((400, 2), np.nan)}, "made.py: row 0, column 'ctrl:shoulder_motor': nan; every row needs its control"),
+    ({"time": 1 - 0.01 * np.arange(400)}, "made.py: row 1, column 'time': 0.99 runs backward from 1;"),
+    ({"qpos": np.zeros((400, 3))}, "made.py: array 'qpos' has shape (400, 3) instead of (400, 2); this model has 2 of them"),
+    ({"qvel": None}, "made.py: array 'qvel' holds object instead of real numbers"),
+    ({"start": 399}, "made.py: start is row 399 of 400"),
+])
+def test_recordings_made_in_python_are_checked_too(change, says):
+    rows = run()
+    sound = Recording("made.py", rows[:, 0], rows[:, 1:3], rows[:, 3:5], rows[:, 5:7])
+    with pytest.raises(RecordingError) as error:
+        diagnose.diagnose(mujoco.MjSpec.from_string(ARM), [dataclasses.replace(sound, **change)])
+    assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_paths_and_recordings_together(tmp_path):
+    (tmp_path / "run.csv").write_bytes(text(run(seed=1)))
+    rows, model = run(), mujoco.MjModel.from_xml_string(ARM)
+    made = Recording("run.csv", rows[:, 0], rows[:, 1:3], rows[:, 3:5], rows[:, 5:7], {"encoder": rows[:, 1]})
+    [other], [same] = diagnose._recordings([tmp_path / "run.csv"], made, model)
+    np.testing.assert_allclose(other.qpos, run(seed=1)[:, 1:3], atol=1e-8)
+    np.testing.assert_array_equal(same.qpos, made.qpos)
+    assert same.name == "held out run.csv" and same.sensors["encoder"].shape == (400, 1)
+    both, none = diagnose._recordings([made, tmp_path / "run.csv"], None, model)
+    assert [len(r.time) for r in both] == [400, 400] and none == []
 
 
 def test_one_file_for_two_purposes_is_refused(tmp_path):
@@ -157,7 +213,7 @@ def test_a_fault_of_the_program_is_one_line_too(tmp_path, capsys, monkeypatch):
     def break_down(*args):
         raise np.linalg.LinAlgError("Singular\nmatrix")
     monkeypatch.setattr(diagnose, "diagnose", break_down)
-    assert diagnose.main(CASES["empty file"].write(tmp_path)) == 2
+    assert diagnose.main(CASES["empty file"].write(tmp_path)) == 1
     err = capsys.readouterr().err
     assert err.startswith("diagnose.py: a fault of this program, not of its input: LinAlgError in test_diagnose.py, line ")
     assert err.count("\n") == 1 and "(Singular matrix)" in err

@@ -306,6 +306,16 @@ def test_recordings_too_short_to_smooth_add_nothing(diagnosis):
     assert "force left at elbow" in report.html_page(diagnosis)
 
 
+def test_rows_before_a_held_out_tail_are_not_drawn(diagnosis):
+    [whole] = diagnosis.held_out
+    tail = replace(whole, start=150, qpos=np.where(np.arange(300)[:, None] < 150, 99.0, whole.qpos))
+    diagnosis.held_out = [tail]
+    assert np.abs(motion.poses(arm(), [tail])).max() < 20 and min(r["x"].max() for r in leftover.residuals(diagnosis)) < 20
+    name, begin, _, motions = motion.overlay(diagnosis)
+    assert name == whole.name and begin >= whole.time[150] and np.abs(motions["measured"]).max() < 20
+    assert f"Held out: {whole.name} from 1.50 s on." in report.html_page(diagnosis)
+
+
 def test_every_pair_of_rivals_has_an_experiment():
     rival = {"effect": "lag", "place": {"kind": "actuator", "name": "drive"}}
     line, = experiments.advice([{"effect": "delay", "place": {"kind": "actuator", "name": "drive"}, "also_possible": [rival]},
