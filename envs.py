@@ -273,8 +273,7 @@ class BatchEnv(VectorEnv):
         x_before = self.qpos[:, 0].copy()
         self._ctrl[:] = actions if applied is None else applied
         self.batch.step(nstep=self.task.frame_skip)
-        if self.batch.warning.any():
-            self._explain_warning()
+        self._check(self.batch)
         self.steps += 1
 
         terminated = self.task.unhealthy(self.qpos, self.qvel)
@@ -306,6 +305,7 @@ class BatchEnv(VectorEnv):
         self.obs = self.observe()
         self._ctrl[:] = applied(self.obs) if callable(applied) else applied
         self.batch.step(nstep=self.task.frame_skip)
+        self._check(self.batch)
         return self.observe()
 
     def peek(self, actions):
@@ -315,6 +315,7 @@ class BatchEnv(VectorEnv):
         self._peek.state[:] = self.batch.state
         self._peek.bind("ctrl")[:, : self._ctrl.shape[1]] = actions
         self._peek.step(nstep=self.task.frame_skip)
+        self._check(self._peek)
         return self.task.observe(self._peek.qpos, self._peek.qvel)
 
     def _reward(self, actions, x_velocity, terminated):
@@ -328,14 +329,17 @@ class BatchEnv(VectorEnv):
             reward -= task.ctrl_weight * np.square(actions).sum(axis=1)
         return reward
 
-    def _explain_warning(self):
+    def _check(self, batch):
+        """Raise EnvError where a batch's last steps became unstable."""
+        if not batch.warning.any():
+            return
         # columns: last offending index, how often; a NaN control counts as unstable too
         kinds = mujoco.mjtWarning
         fatal = [int(w) for w in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC, kinds.mjWARN_BADCTRL)]
-        unstable = np.flatnonzero(self.batch.warning[:, fatal, 1].any(axis=1))
+        unstable = np.flatnonzero(batch.warning[:, fatal, 1].any(axis=1))
         if unstable.size:
             raise EnvError(
                 f"{self.env_id}: the simulation became unstable (NaN or huge values) in environment {unstable[0]} at step "
                 f"{self.steps[unstable[0]]}: if --real changed the model, choose a smaller change"
             )
-        self.batch.warning[:] = 0
+        batch.warning[:] = 0

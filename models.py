@@ -170,7 +170,7 @@ class Regressor(nn.Module):
         has not improved for `patience` epochs.
 
         Args: x (N, n_in), y (N, n_out) float32 tensors; generator: the split and the batches are drawn from it.
-        Returns: the RMS error of each output on the held-out rows, (n_out,). Keeps the best epoch's weights.
+        Returns: the RMS error of each output on the held-out rows, (n_out,), which chose the best epoch, whose weights stay.
         """
         order = torch.randperm(len(x), generator=generator)
         held, train = order[: max(1, len(x) // 5)], order[max(1, len(x) // 5) :]

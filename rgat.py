@@ -19,10 +19,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch
 
+from envs import EnvError
 from models import ForwardModel, GaussianPolicy, InverseModel, Value
 from trpo import TRPO, TRPOConfig, rollouts
 
-# section IV-D: the action transformer's own trust region, entropy and discount
+# the action transformer's own trust region, entropy and discount; section IV-D has 1e-4, 1e-5 and 0.99 (see README)
 AT_CONFIG = TRPOConfig(batch_size=1024, max_kl=1e-2, entropy=1e-5, gamma=0.0)
 
 
@@ -57,6 +58,8 @@ class RealModel:
         torch.manual_seed(seed)
         self.net = ForwardModel(*(space.shape[0] for space in (self.sim.single_observation_space, self.sim.single_action_space)))
         seen = tau_real if not self.residual else tau_real[measured(self.sim, tau_real.s)]
+        if len(seen) < 2:
+            raise EnvError(f"{len(seen)} usable real transitions are too few to fit a model on: raise --real-trajectories")
         guess = predict_all(self.sim, seen) if self.residual else seen.s
         s, a, s_next = seen.tensors()
         return self.net.fit(s, a, s_next, torch.from_numpy(guess), torch.Generator().manual_seed(seed))
@@ -158,7 +161,7 @@ class ActionTransformerEnv(VectorEnv):
 
 @dataclass(frozen=True)
 class GroundingSettings:
-    """What the grounding methods can be told; defaults are the paper's where it gives them."""
+    """What the grounding methods can be told. Where defaults differ from the paper's, README says why."""
 
     at: TRPOConfig = AT_CONFIG  # rgat: TRPO for the action transformer
     at_std: float = 0.01  # rgat: its initial standard deviation, in units of the action range
@@ -218,7 +221,7 @@ class RGAT(Grounding):
         return {"forward_model_error": relative(self.real_model.fit(tau_real, seed), tau_real)}
 
     def update(self, policy, steps, seed, on_update=None):
-        """g_phi goes on from the last grounding step, as Algorithm 1 has it: at max KL 1e-4 one step's updates are few."""
+        """g_phi goes on from the last grounding step, as Algorithm 1 has it."""
         if not self.learner.value.normalizer.count:
             torch.manual_seed(seed)
             self._new_transformer()

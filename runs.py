@@ -22,6 +22,7 @@ PROGRESS = (
     "grounding_step real_transitions sim_steps real_return_deterministic real_return_deterministic_se "
     "real_return_stochastic forward_model_error at_one_step_error identity_one_step_error delta_action_rms at_std kl seconds"
 ).split()
+ALWAYS = [k for k in PROGRESS if k.startswith("real_")] + ["grounding_step", "sim_steps", "seconds"]  # numbers in every row
 TRAIN = (
     "grounding_step phase steps return reward kl surrogate_gain step_size line_search entropy explained_variance std"
 ).split()
@@ -61,9 +62,9 @@ class Run:
     def create(cls, folder, settings):
         """A new folder for a run with these settings (a dict). Raises RunError if it holds a run or cannot be made."""
         run = cls(folder)
-        if (run.folder / "config.json").exists():
-            raise RunError(f"{folder} already holds a run: continue it with --resume {folder}, or choose another --out")
         try:
+            if (run.folder / "config.json").exists():
+                raise RunError(f"{folder} already holds a run: continue it with --resume {folder}, or choose another --out")
             run.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RunError(f"cannot make the folder {folder}: {error.strerror}; choose another --out") from None
@@ -78,6 +79,8 @@ class Run:
             config = json.loads((run.folder / "config.json").read_text())
             settings = config["settings"]
             run.progress = run._read("progress.csv")
+            for row in run.progress:
+                [float(row[k]) for k in ALWAYS]
             done = len(run.progress)
             run.train = [row for row in run._read("train.csv") if int(row["grounding_step"]) < max(done, 1)]
             if (run.folder / "lines.json").exists():

@@ -99,7 +99,7 @@ class Settings:
             raise RunError(f"--at-gamma is {done.at_gamma}: it must be at least 0 and below 1")
         if not 0 <= done.ane_width < np.inf or not 0 <= done.at_entropy < np.inf:
             raise RunError("--ane-width and --at-entropy must be 0 or more")
-        parse_perturbation(done.real)
+        BatchEnv(done.env, 1, parse_perturbation(done.real), nthread=1)  # names that are not in the model end here
         return done
 
 
@@ -210,13 +210,15 @@ def start(s, run, sim, real, bar):
             learner.load(saved["learner"])
             if done:
                 grounding.load(saved["grounding"])
-        except (KeyError, RuntimeError, TypeError, ValueError):
+        except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
             raise RunError(f"{run.folder}/step_{done:02d}.pt does not belong to this run: start a new one") from None
         for step in range(1, done + 1):
             tau_real += Transitions(*run.real(step))
         bar.skip(int(run.progress[-1]["real_transitions" if s.algo == "real" else "sim_steps"]))
         if not run.lines:
             reference(s, run, learner, real, bar)
+        elif s.algo != "real":
+            bar.skip(s.reference_steps, counts=False)
         bar.lap()
         return learner, grounding, tau_real
 
@@ -253,7 +255,8 @@ def pretrained(s, world, env, steps, bar):
     path = folder / f"{s.env}-{world}-{key}.pt"
     learner = new_learner(s)
     if path.exists():
-        bar.skip(steps, counts=world == bar.world)
+        whole = learner.batch_steps(env)
+        bar.skip(-(-steps // whole) * whole, counts=world == bar.world)
         try:
             learner.load(load_checkpoint(path))
         except (ValueError, KeyError, TypeError, RuntimeError):
@@ -305,7 +308,8 @@ class Bar:
     def skip(self, steps, counts=True):
         """Steps that an earlier run has done; counts: they are this run's own, not a reference line's."""
         self.seen += steps * counts
-        self.tqdm.update(steps)
+        for count in ("initial", "n", "last_print_n") if not self.tqdm.disable else ():  # they tell nothing about the speed
+            setattr(self.tqdm, count, getattr(self.tqdm, count) + steps)
 
     def lap(self):
         """(environment steps, seconds) since the last lap."""
@@ -321,7 +325,7 @@ def verdict(s, run):
     """The best policy judged once more, on real episodes that did not choose it: best.json, and a line that says so."""
     step = max(range(len(run.progress)), key=lambda k: float(run.progress[k]["real_return_deterministic"]))
     policy = run.policy()
-    real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real))
+    real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=s.threads)
     returns = rollouts(policy, real, 2 * s.eval_episodes, seed_for(s.seed, step, "best"), deterministic=True)[0]
     best = {"grounding_step": step, "episodes": len(returns), "real_return_deterministic": float(returns.mean()), "se": standard_error(returns)}
     write_whole(run.folder / "best.json", json.dumps(best, indent=1))
@@ -391,7 +395,7 @@ def main(argv=None):
         print(f"train.py: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"\nstopped; go on with: python train.py --resume {run.folder if run else ''}", file=sys.stderr)
+        print(f"\nstopped; go on with: python train.py --resume {run.folder}" if run else "\nstopped", file=sys.stderr)
         return 130
 
 

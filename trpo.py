@@ -93,8 +93,8 @@ def fisher_product(policy, obs, damping):
     """v -> (F + damping I) v, F the Fisher matrix of the policy at its present parameters, over obs (N, nobs).
 
     For a Gaussian, F is the mean over obs of J' diag(1/sigma^2) J, J the Jacobian of the action's mean, and 2 for
-    each log sigma: what the Hessian of KL(pi || pi_theta) at theta = pi comes to. J' u is linear in u, so
-    differentiating it by u gives J v, and F is never formed.
+    each log sigma: what the Hessian of KL(pi || pi_theta) at theta = pi comes to (its gradient is 0 there). J' u is
+    linear in u, so differentiating it by u gives J v, and F is never formed.
     """
     weights, log_std = list(policy.net.parameters()), policy.log_std.detach()
     sizes = [len(log_std), *(w.numel() for w in weights)]
@@ -224,15 +224,19 @@ class TRPO:
         self.value.load_state_dict(state["value"])
         self.optimizer.load_state_dict(state["optimizer"])
 
-    def learn(self, env, steps, seed, freeze_normalizer=True, update_policy=True, on_update=None):
+    def batch_steps(self, env):
+        """Transitions of one update in env: the batch size in whole rows of its environments."""
+        return max(1, self.config.batch_size // env.num_envs) * env.num_envs
+
+    def learn(self, env, steps, seed, freeze_normalizer=True, on_update=None):
         """Train on env for at least `steps` transitions, in whole batches; seed decides every random number.
 
-        freeze_normalizer: keep the observation statistics as they are; update_policy=False trains the value
-        function alone. on_update(stats) is called with a dict after every update.
+        freeze_normalizer: keep the observation statistics as they are. on_update(stats) is called with a dict after
+        every update of the policy; the value may then still be fitting, and stands still once learn returns.
         """
         self.generator.manual_seed(seed)
         obs, _ = env.reset(seed=seed)
-        horizon = max(1, self.config.batch_size // env.num_envs)
+        horizon = self.batch_steps(env) // env.num_envs
         adapt = self.config.normalize_obs and not freeze_normalizer
         returns_of = EpisodeReturns(env.num_envs)
         done_steps = 0
@@ -242,7 +246,7 @@ class TRPO:
                 batch, obs = self.collect(env, obs, horizon)
                 done_steps += horizon * env.num_envs
                 value_fit.result()
-                stats, value_fit = self.update(batch, update_policy, beside)
+                stats, value_fit = self.update(batch, beside)
                 if adapt:
                     for network in (self.policy, self.value):
                         network.normalizer.update(torch.from_numpy(batch["obs"].reshape(-1, batch["obs"].shape[-1])))
@@ -275,7 +279,7 @@ class TRPO:
         config = self.config
         return gae(batch["reward"], value, next_value, batch["terminated"], batch["done"], config.gamma, config.lam), value
 
-    def update(self, batch, update_policy, beside):
+    def update(self, batch, beside):
         """Update the policy from collect()'s arrays and start fitting the value in `beside`, an executor.
 
         Returns the statistics to log, and the future that ends with the fit.
@@ -285,9 +289,7 @@ class TRPO:
         obs, action = (torch.from_numpy(batch[k]).flatten(0, 1) for k in ("obs", "action"))
         targets = torch.from_numpy(returns.reshape(-1)).float()
         value_fit = beside.submit(value_update(self.value, self.optimizer, obs, targets, self.config, self.generator))
-        stats = {}
-        if update_policy:
-            stats = policy_update(self.policy, obs, action, torch.from_numpy(advantage.reshape(-1)), self.config)
+        stats = policy_update(self.policy, obs, action, torch.from_numpy(advantage.reshape(-1)), self.config)
         stats["explained_variance"] = explained_variance(value, returns)
         stats["std"] = float(self.policy.log_std.detach().exp().mean())
         stats["reward"] = float(batch["reward"].mean())

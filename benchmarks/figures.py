@@ -50,7 +50,7 @@ def draw_grounding(rows, best):
             mean, se = values.mean(0), values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.zeros(length)
             axes.plot(mean, color=COLORS[algo], lw=2, marker="o", ms=3, label=f"{algo}, {seeds_of(values)}")
             axes.fill_between(range(length), mean - se, mean + se, color=COLORS[algo], alpha=0.2, lw=0)
-        lines = [row for row in best if (row["env"], row["policy"], row["tag"]) == (env, policy, "default")]
+        lines = [row for row in best if (row["env"], row["policy"], row["tag"]) == (env, policy, "default") and row["algo"] != "real"]
         for column, color in (("trained_on_real", COLORS["real"]), ("before_grounding", COLORS["sim"])):
             values = [float(v) for v in {row["seed"]: row[column] for row in lines if row[column]}.values()]
             if values:

@@ -41,7 +41,8 @@ def main():
                 options = ["--resume", str(folder)]
             if train.main(options):
                 sys.exit(f"{folder}: stopped; call again to go on")
-            append(args.results / "grounding.csv", [{**key, **row} for row in csv.DictReader((folder / "progress.csv").open(newline=""))])
+            if not finished(args.results / "grounding.csv", key):
+                append(args.results / "grounding.csv", [{**key, **row} for row in csv.DictReader((folder / "progress.csv").open(newline=""))])
             with (folder / "progress.csv").open(newline="") as file:
                 before = next(csv.DictReader(file))["real_return_deterministic"]
             best, lines = (json.loads((folder / name).read_text()) for name in ("best.json", "lines.json"))

@@ -2,6 +2,7 @@
 import io
 import os
 import sys
+from concurrent.futures import Future
 from dataclasses import replace
 
 import gymnasium
@@ -12,6 +13,7 @@ from gymnasium.vector import VectorEnv
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+import trpo
 from envs import BatchEnv
 from models import GaussianPolicy, Value
 from trpo import (
@@ -389,11 +391,52 @@ def test_observation_statistics_move_only_when_told():
     assert float(learner.policy.normalizer.count) == float(learner.value.normalizer.count) == 256
 
 
-def test_warming_up_the_value_leaves_the_policy():
+class InTurn:
+    """An executor that does its work at once, in the caller's own thread."""
+
+    def __init__(self, workers):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+    def submit(self, work):
+        future = Future()
+        future.set_result(work())
+        return future
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_the_value_fitted_beside_is_the_value_fitted_in_turn(normalize, monkeypatch):
+    learners = []
+    for executor in (trpo.ThreadPoolExecutor, InTurn):
+        monkeypatch.setattr(trpo, "ThreadPoolExecutor", executor)
+        env, learner = new_learner("Hopper-v4", batch_size=256, normalize_obs=normalize)
+        learner.learn(env, 1500, seed=2, freeze_normalizer=False)
+        learners.append(learner)
+    for network in ("policy", "value"):
+        one, other = (getattr(learner, network).state_dict() for learner in learners)
+        assert all(torch.equal(one[k], other[k]) for k in one)
+
+
+def test_a_fault_of_the_value_fit_is_not_lost(monkeypatch):
+    def fault(*arguments):
+        raise ArithmeticError("no fit")
+
     env, learner = new_learner("InvertedPendulum-v4", batch_size=256)
-    policy, value = flat(learner.policy).clone(), flat(learner.value).clone()
-    learner.learn(env, 256, seed=0, update_policy=False)
-    assert torch.equal(policy, flat(learner.policy)) and not torch.equal(value, flat(learner.value))
+    monkeypatch.setattr(learner.optimizer, "step", fault)
+    with pytest.raises(ArithmeticError, match="no fit"):
+        learner.learn(env, 256, seed=0)
+
+
+def test_no_steps_change_nothing():
+    env, learner = new_learner("InvertedPendulum-v4", batch_size=256)
+    before = flat(learner.policy).clone(), flat(learner.value).clone()
+    learner.learn(env, 0, seed=0)
+    assert torch.equal(before[0], flat(learner.policy)) and torch.equal(before[1], flat(learner.value))
 
 
 def test_it_learns_the_pendulum():
