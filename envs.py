@@ -211,7 +211,8 @@ class BatchEnv(VectorEnv):
             raise EnvError(f"the given model has {sizes}: give one with the same joints")
         if perturbation:
             perturb(self.model, perturbation)
-        self.dt = self.model.opt.timestep * self.task.frame_skip
+        self.dt = nominal.opt.timestep * self.task.frame_skip
+        self.frame_skip = max(1, round(self.dt / self.model.opt.timestep))  # a given model may take finer steps
         # v4 pays for the step that falls, v5 does not
         self._pays_on_end = env_id.endswith("v4")
 
@@ -272,7 +273,7 @@ class BatchEnv(VectorEnv):
             raise EnvError(f"actions have shape {actions.shape}: {self.env_id} takes {self.action_space.shape}")
         x_before = self.qpos[:, 0].copy()
         self._ctrl[:] = actions if applied is None else applied
-        self.batch.step(nstep=self.task.frame_skip)
+        self.batch.step(nstep=self.frame_skip)
         self._check(self.batch)
         self.steps += 1
 
@@ -304,7 +305,7 @@ class BatchEnv(VectorEnv):
         self.batch.forward()
         self.obs = self.observe()
         self._ctrl[:] = applied(self.obs) if callable(applied) else applied
-        self.batch.step(nstep=self.task.frame_skip)
+        self.batch.step(nstep=self.frame_skip)
         self._check(self.batch)
         return self.observe()
 
@@ -314,7 +315,7 @@ class BatchEnv(VectorEnv):
             self._peek = Batch(self.model, self.num_envs, self.batch.nthread)
         self._peek.state[:] = self.batch.state
         self._peek.bind("ctrl")[:, : self._ctrl.shape[1]] = actions
-        self._peek.step(nstep=self.task.frame_skip)
+        self._peek.step(nstep=self.frame_skip)
         self._check(self._peek)
         return self.task.observe(self._peek.qpos, self._peek.qvel)
 

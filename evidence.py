@@ -35,7 +35,7 @@ def crossed(search, fit, windows, position_noise):
 
     Where there is but one recording: the other thirds of it. The values without some are one step from the fit's.
     """
-    recordings = list({id(w.recording): w.recording for w in windows}.values())
+    recordings = list({id(w.recording): w.recording for w in [*search.problem.windows, *windows]}.values())
 
     def block(w):
         if len(recordings) > 1:

@@ -6,6 +6,7 @@
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 import evidence
@@ -59,11 +60,25 @@ def place_of(candidate):
 def parameters_of(candidate, values, bounds=None):
     out = []
     for i, (p, v) in enumerate(zip(candidate.parameters, values)):
-        entry = {"name": p.name, "nominal": float(p.nominal), "value": float(v), "unit": p.unit}
+        entry = {"name": p.name, "nominal": float(p.nominal), "value": float(np.clip(v, p.low, p.high)), "unit": p.unit}
+        if candidate.effect.name == "unknown":
+            entry["at"] = candidate.effect.knots[i]
         if bounds:
             entry["low"], entry["high"] = (float(b) for b in bounds[i])
         out.append(entry)
     return out
+
+
+def removed(without, after, before):
+    """Share of the nominal model's error that a finding removes; a prediction that blows up errs by infinity."""
+    if np.isinf(without) or np.isinf(after):
+        return float(np.isinf(without)) - float(np.isinf(after))
+    return (without - after) / max(before, 1e-12)
+
+
+def unexplained(before, after, floor):
+    """Share of the nominal model's squared error that is left above a perfect simulator's."""
+    return 1.0 if np.isinf(after) else float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1))
 
 
 def noise_by_channel(model, position_noise):
@@ -86,19 +101,21 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     for candidate, values in fit.hypothesis.effects:
         without = evidence.prediction_error(world, fit.hypothesis.minus(candidate).settings, held, noise)[0]
         curve = candidate.effect.name == "unknown"
+        form = {key: getattr(candidate.effect, key) for key in ("variable", "factor", "wave")} if curve else None
         findings.append({
             "effect": candidate.effect.name, "place": place_of(candidate),
             "parameters": parameters_of(candidate, values, bounds[candidate]),
-            "evidence": {"held_out_error_removed": (without - after) / max(before, 1e-12),
+            "evidence": {"held_out_error_removed": removed(without, after, before),
                          "p_value": search.significance(fit, candidate)[0]},
             "depends_on": list(left.variables) if curve else depends_on(model, candidate), "when": None, "written_as": written[candidate],
-            "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible.get(candidate, []))})
+            "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible.get(candidate, [])),
+            **({"curve": form} if curve else {})})
     if event:
         findings.append(event_finding(event, train))
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     summary = {"format": 1, "verdict": "mismatch" if findings else "match",
                "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,
-               "unexplained": {"fraction": float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1)),
+               "unexplained": {"fraction": unexplained(before, after, floor),
                                "place": {"kind": "joint", "name": hint.joint} if hint else None,
                                "depends_on": list(hint.variables) if hint else []}}
     return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
@@ -137,6 +154,7 @@ def unit_of(model, channel):
     return "rad"
 
 
+JOINT_TRANSMISSIONS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 # What the force of an effect varies with.
 VARIABLES = {"velocity": ("viscous_damping", "quadratic_damping", "coulomb_friction", "stribeck_friction", "back_emf"),
              "position": ("stiffness", "nonlinear_stiffness", "joint_stop", "backlash", "cogging"),
@@ -148,7 +166,10 @@ def depends_on(model, candidate):
     variable = next((v for v, names in VARIABLES.items() if candidate.effect.name in names), None)
     name = candidate.place.name
     if variable == "velocity" and candidate.place.kind == "actuator":
-        name = cut.joint_name(model, model.actuator(name).trnid[0])
+        actuator = model.actuator(name)
+        if actuator.trntype[0] not in JOINT_TRANSMISSIONS:  # a site or tendon moves with many joints
+            return []
+        name = cut.joint_name(model, actuator.trnid[0])
     return [f"{variable}:{name}"] if variable else []
 
 

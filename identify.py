@@ -1,6 +1,6 @@
 """The statistical method: which physics a simulator lacks, where, how large, and how sure.
 
-    diagnosis = identify(world, train, held_out)     # physics.World, lists of recordings.Recording
+    diagnosis = identify(world, train, held_out)     # world.World, lists of recordings.Recording
     diagnosis.summary["findings"]; diagnosis.corrected_xml
 
 1. Noise from differences of the recordings and from short windows that the nominal model can follow.
@@ -44,7 +44,7 @@ FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the 
 def identify(world, train, held_out, progress=None):
     """Diagnose a simulator from recordings.
 
-    world: physics.World; train, held_out: lists of Recording (held_out is used for nothing but the final figures).
+    world: world.World; train, held_out: lists of Recording (held_out is used for nothing but the final figures).
     progress(done, message): called with the share done, 0..1. Raises RecordingError where the data say too little.
     """
     say = progress or (lambda done, message: None)

@@ -38,9 +38,9 @@ class JointEffect(Effect):
     def travel(model, i, recordings):
         """All recorded positions and speeds of the joint, speeds by differences."""
         q = model.jnt_qposadr[i]
-        speed = [np.diff(r.qpos[:, q]) / np.diff(r.time) for r in recordings]
-        position, speed = np.concatenate([r.qpos[:, q] for r in recordings]), np.concatenate(speed)
-        return position[np.isfinite(position)], abs(speed[np.isfinite(speed)])
+        known = [np.isfinite(r.qpos[:, q]) for r in recordings]  # between measured rows, be they next to each other or not
+        speed = [np.diff(r.qpos[k, q]) / np.diff(r.time[k]) for r, k in zip(recordings, known)]
+        return np.concatenate([r.qpos[k, q] for r, k in zip(recordings, known)]), abs(np.concatenate(speed))
 
 
 class JointNumber(JointEffect):

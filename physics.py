@@ -129,7 +129,7 @@ class LinkLength(Effect):
         return 'mjcf'
 
 
-# ---------------------------------------------------------------- sensors
+# ---------------------------------------------------------------- loads that may come and go
 
 @catalogue
 class ExternalForce(Effect):

@@ -206,6 +206,3 @@ class GroundHeight(Effect):
     def write(self, spec, model, i, values):
         spec.geom(model.geom(i).name).pos[2] = values[0]
         return 'mjcf'
-
-
-# ---------------------------------------------------------------- forces from outside

@@ -1,6 +1,6 @@
 """Is anything left, and on what does it depend? The residual force in each joint against position, velocity, control, time.
 
-    found = leftover(search, problem, fit, least)        # None, or a Leftover
+    found = leftover(search, problem, fit, bare)         # None, or a Leftover
     found.candidate                                      # the `unknown` effect that models it
 
 Curves of one variable are simulated, one column per knot. For the rest: in short windows an extra joint force is nearly

@@ -232,7 +232,9 @@ def measurement_noise(model, recordings):
             column = _tangent_column(model, recording, dof)
             p.append(difference_noise(column))
             v.append(difference_noise(recording.qvel[:, dof]))
-        position[dof], velocity[dof] = np.median(p), np.median(v)
+        for noise, found in ((position, p), (velocity, v)):  # of the recordings that measured it
+            found = np.array(found)[np.isfinite(found)]
+            noise[dof] = np.median(found) if len(found) else np.inf
     for name, dofs in channels(model).items():  # components of one channel share their noise
         position[dofs] = np.sqrt(np.mean(position[dofs] ** 2))
     return position, velocity

@@ -48,7 +48,7 @@ class Working:
             material.textures = [''] * len(material.textures)
         for texture in spec.textures:
             spec.delete(texture)
-        for candidate in structure:
+        for candidate in sorted(structure, key=lambda c: (c.effect.name, c.place.kind, c.place.name)):  # the same in every process
             candidate.effect.build(spec, nominal, candidate.effect.id(nominal, candidate.place.name))
         self.model = m = spec.compile()
         idle = mujoco.mjtDisableBit.mjDSBL_ISLAND if m.ntree < 2 else 0

@@ -143,6 +143,18 @@ def geoms_of(tree, body):
     return find(tree, "body", body).findall("geom")
 
 
+def test_a_given_model_with_finer_steps_takes_more_of_them():
+    fine = mujoco.MjModel.from_xml_path(str(envs.model_path("Hopper-v4")))
+    fine.opt.timestep /= 4
+    ours, theirs = (BatchEnv("Hopper-v4", 2, model=model, nthread=1) for model in (fine, None))
+    assert ours.dt == theirs.dt == gymnasium.make("Hopper-v4").unwrapped.dt
+    ends = []
+    for env in (ours, theirs):
+        env.reset(seed=0)
+        ends.append(env.step(np.zeros((2, 3)))[0])
+    np.testing.assert_allclose(*ends, atol=1e-4)
+
+
 def states(env_id, steps, perturbation="", model=None, seed=2):
     """qpos and qvel along a fixed random action sequence, with no restarts: (steps, 4, nq + nv)."""
     env = BatchEnv(env_id, 4, parse_perturbation(perturbation), model=model, nthread=1)

@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import evidence
+import findings
 import misfit
 import scores
+import selection
 import shooting
 import unknown
 import windows as cut
@@ -141,6 +143,43 @@ def test_p_values_hold_under_correlated_residuals():
         residual = rng.normal(size=(24, 30)) + rng.normal(size=(24, 1))  # chi-square would reject half of these
         low.append(scores.wald(np.einsum("cmk,cml->ckl", column, column), np.einsum("cmk,cm->ck", column, residual))[2] < 0.05)
     assert 0.02 < np.mean(low) < 0.09
+
+
+def test_noise_is_that_of_the_recordings_that_measured_it():
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded(f"run{k}.csv", k) for k in range(3)]
+    alone = cut.measurement_noise(world.model, runs[:1])[0]
+    for run in runs[1:]:
+        run.qpos[:] = np.nan
+    np.testing.assert_array_equal(cut.measurement_noise(world.model, runs)[0], alone)
+
+
+def test_every_other_position_still_has_probes_for_friction():
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    candidate, run = world.candidate("stribeck_friction", "pivot"), recorded("run.csv", 1, noise=0.0)
+    whole = world.probes(candidate, [run])
+    run.qpos[1::2] = np.nan
+    np.testing.assert_allclose(world.probes(candidate, [run]), whole, rtol=0.1)
+
+
+def test_crossed_takes_windows_of_recordings_that_the_search_did_not_see():
+    runs = [recorded(f"run{k}.csv", k, damping=0.08) for k in range(4)]
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    noise = np.array([NOISE])
+    problem = misfit.Problem(world, [w for r in runs[:3] for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
+    damping = world.candidate("viscous_damping", "pivot")
+    [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(damping, (0.06,))], shooting.fit_starts(problem, misfit.Hypothesis()))
+    before, after = evidence.crossed(selection.Search(world, problem, runs), fit, evidence.consecutive(runs[1:], 0.3), noise)
+    assert after < 0.5 * before
+
+
+def test_what_a_motor_at_a_site_depends_on_is_no_joint():
+    xml = """<mujoco><worldbody><body name="drone"><freejoint name="root"/><geom size=".1"/><site name="s"/></body></worldbody>
+      <actuator><motor name="a" site="s" gear="0 0 1 0 0 0"/><motor name="b" site="s" gear="0 0 1 0 0 .1"/></actuator></mujoco>"""
+    world = World(mujoco.MjSpec.from_string(xml))
+    for actuator in "ab":
+        assert findings.depends_on(world.model, world.candidate("back_emf", actuator)) == []
+        assert findings.depends_on(world.model, world.candidate("gain", actuator)) == [f"control:{actuator}"]
 
 
 # ---- shooting ----------------------------------------------------------------------------------
