@@ -178,7 +178,7 @@ def main(argv=None):
                 bar = tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", file=sys.stderr)
             given, held_out = _expanded(args.recordings), _expanded(args.held_out)
             diagnosis = diagnose(args.model or args.env, given, held_out, bar and progress)
-            report.write(diagnosis, args.out)
+            files = report.write(diagnosis, args.out)
     except (recorded.RecordingError, ModelError, report.ReportError, mujoco.FatalError, MemoryError) as error:
         if bar:
             bar.close()
@@ -199,7 +199,7 @@ def main(argv=None):
     if bar:
         bar.close()
     sys.stdout.reconfigure(errors="replace")  # a terminal that cannot show ± or ∞ still shows the rest
-    print(wording.terminal(diagnosis.summary, args.out.rstrip("/")))
+    print(wording.terminal(diagnosis.summary, args.out.rstrip("/"), files))
     return 0
 
 

@@ -2,11 +2,12 @@
 
 The page is one file: drawings are inline SVG, nothing is fetched, and it reads on a phone, in light and in dark.
 """
-import fnmatch
 import html
+import itertools
 import json
 import math
 import os
+import re
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from figures import Series, binned, chart, whisker
 from page import SCRIPT, STYLE
 
 E = html.escape
+PER_PERIOD, PER_CURVE = 40, 201  # rows of a saved sine per period, and of another saved curve
 
 
 class ReportError(ValueError):
@@ -39,28 +41,54 @@ def check_folder(out):
 
 
 def write(diagnosis, out):
-    """Write diagnosis.json, corrected.xml, report.html (and unknown_<n>.csv for unknown forces) into folder `out`.
+    """Write report.html, diagnosis.json, corrected.xml and a curve for each unknown force into folder `out`; their names.
 
-    All are complete under temporary names before the first takes its own. Raises ReportError where that fails; what was
-    in the folder before is then unchanged.
+    A curve is unknown_<n>.csv, the first n that is free, and named in its finding as `saved_as`; those of the earlier
+    diagnosis in the folder go. All are complete under temporary names before the first takes its own. Raises ReportError
+    where that fails; what was in the folder before is then unchanged.
     """
-    files = {"diagnosis.json": json.dumps(plain(diagnosis.summary), indent=2, allow_nan=False, ensure_ascii=False) + "\n",
-             "corrected.xml": diagnosis.corrected_xml, "report.html": html_page(diagnosis)}
-    for n, curve in enumerate(unknown_curves(diagnosis), start=1):
-        rows = zip(np.asarray(curve["x"], float).tolist(), np.asarray(curve["force"], float).tolist())
-        lines = [f"{curve['variable']},force", *(f"{x:.9g},{force:.9g}" for x, force in rows)]
-        files[f"unknown_{n}.csv"] = "\n".join(lines) + "\n"
+    summary, earlier = plain(diagnosis.summary), _earlier(out)
+    names = (f"unknown_{n}.csv" for n in itertools.count(1))
+    free = (name for name in names if name in earlier or not os.path.lexists(os.path.join(out, name)))
+    saved = {name: curve for name, curve in zip(free, unknown_curves(diagnosis))}
+    for name, curve in saved.items():
+        summary["findings"][curve["finding"]]["saved_as"] = name
+    files = {"report.html": html_page(diagnosis),
+             "diagnosis.json": json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n",
+             "corrected.xml": diagnosis.corrected_xml, **{name: _csv(curve) for name, curve in saved.items()}}
     made = not os.path.isdir(out)
     try:
         os.makedirs(out, exist_ok=True)
         write_together({os.path.join(out, name): text for name, text in files.items()})
-        for name in fnmatch.filter(os.listdir(out), "unknown_*.csv"):  # of an earlier diagnosis
-            if name not in files:
-                os.remove(os.path.join(out, name))
+        for name in earlier - set(files):
+            os.remove(os.path.join(out, name))
     except (OSError, WriteError) as error:
         if made and os.path.isdir(out) and not os.listdir(out):
             os.rmdir(out)
         raise ReportError(f"the report is not written: {error}") from None
+    return list(files)
+
+
+def _earlier(out):
+    """The curves in folder `out` that an earlier diagnosis there says are its own."""
+    try:
+        with open(os.path.join(out, "diagnosis.json"), encoding="utf-8") as stream:
+            names = {str(finding.get("saved_as")) for finding in json.load(stream)["findings"]}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return set()
+    return {name for name in names if re.fullmatch(r"unknown_\d+\.csv", name) and os.path.isfile(os.path.join(out, name))}
+
+
+def _csv(curve):
+    """A curve as it acts: its variable, what it is multiplied by, if anything (at -1 and at 1: it is proportional), force."""
+    factor, levels = curve["factor"], (-1.0, 1.0) if curve["factor"] else (1.0,)
+    head = [curve["variable"]] + ([_multiplier(factor)] if factor else []) + ["force"]
+    rows = [[x, *([level] if factor else []), level * force] for level in levels for x, force in zip(curve["x"], curve["force"])]
+    return "\n".join([",".join(head), *(",".join(f"{value:.9g}" for value in row) for row in rows)]) + "\n"
+
+
+def _multiplier(factor):
+    return f"sign({factor})" if factor.startswith("velocity") else factor
 
 
 def plain(value):
@@ -126,7 +154,8 @@ def _table(heads, rows, look=""):
 
 def _head(summary, title):
     findings = "".join(f"<li>{E(wording.finding_words(finding))}</li>" for finding in summary["findings"])
-    before, after, floor, unit, place = wording.errors(summary)
+    *values, unit, place = wording.errors(summary)
+    before, after, floor = (wording.number(value, 2) for value in values)
     steps = "".join(f'<div class="{look}"><b>{E(value)} <small>{E(unit)}</small></b><span>{words}</span></div>'
                     for value, look, words in ((before, "nominal", "nominal model"), (after, "corrected", "corrected model"),
                                                (floor, "noise", "perfect simulator")))
@@ -175,16 +204,18 @@ def _findings(diagnosis):
 
 def _parameter(p):
     """The row of a parameter; one that moves nothing in the recordings stays where it was."""
+    stop = wording.no_stop(p["name"], p["value"])
     seen = p["value"] != p["nominal"]
-    return [E(p["name"]), E(wording.estimate(p)) if seen else "not seen in these recordings", E(wording.number(p["nominal"])),
-            whisker(p) if seen else ""]
+    return [E(p["name"]), E(stop or wording.estimate(p)) if seen else "not seen in these recordings",
+            E("none" if wording.no_stop(p["name"], p["nominal"]) else wording.number(p["nominal"])),
+            whisker(p) if seen and not stop else ""]
 
 
 def _facts(finding):
     """The evidence for a finding, in words."""
     facts = []
     for key, value in (finding.get("evidence") or {}).items():
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
             facts.append(f"removes {100 * value:.0f} % of the held-out error" if key == "held_out_error_removed" else
                          f"p {wording.p_value(value)}" if key == "p_value" else
                          f"{key.replace('_', ' ')} {wording.number(value)}")
@@ -193,22 +224,43 @@ def _facts(finding):
 
 
 def unknown_curves(diagnosis):
-    """[{finding: index, variable, x, force (n,), unit}]: the fitted curves of findings that the catalogue cannot name."""
+    """The fitted curves of findings that the catalogue cannot name, one dict each: finding (index), variable, factor, period
+    (s, of a sine, or None), x, force (n,), unit. Force between neighbouring x is linear; a sine spans all recordings."""
     curves = []
     for index, finding in enumerate(diagnosis.summary["findings"]):
         for candidate, values in diagnosis.settings.items():
             if finding["effect"] == "unknown" == candidate.effect.name and candidate.place.name == finding["place"]["name"]:
-                curves.append({"finding": index, "variable": candidate.effect.variable, "x": np.array(candidate.effect.knots),
-                               "force": np.array(values), "unit": candidate.parameters[0].unit})
+                effect, period = candidate.effect, None
+                if effect.wave:
+                    period = 4 * (effect.knots[1] - effect.knots[0])
+                    times = np.concatenate([r.time for r in [*diagnosis.train, *diagnosis.held_out]])
+                    x = np.arange(times.min(), times.max() + period / PER_PERIOD, period / PER_PERIOD)
+                    turn = 2 * np.pi * (x - effect.knots[0]) / period
+                    force = values[0] * np.cos(turn) + values[1] * np.sin(turn)
+                else:
+                    x = np.union1d(effect.knots, np.linspace(effect.knots[0], effect.knots[-1], PER_CURVE))
+                    force = np.interp(x, effect.knots, values)
+                curves.append({"finding": index, "variable": effect.variable, "factor": effect.factor, "period": period,
+                               "x": x, "force": force, "unit": candidate.parameters[0].unit})
     return curves
 
 
 def _curve(curve, parameters):
-    """The unknown force against its variable, with the 95 % interval at each knot."""
-    band = np.array([[p.get("low", np.nan), p.get("high", np.nan)] for p in parameters], dtype=float)
-    lines = [Series(curve["x"], band, "corrected", "band")] if len(band) == len(curve["x"]) and np.isfinite(band).all() else []
-    return _box(chart([*lines, Series(curve["x"], curve["force"], "corrected")], wording.axis_words(curve["variable"]),
-                      f"force ({curve['unit']})", label="the unknown force"))
+    """The unknown force against its variable, with the 95 % interval of what is linear between knots."""
+    x, force, lines, note = curve["x"], curve["force"], [], ""
+    if curve["period"]:
+        x, force = x[:3 * PER_PERIOD + 1], force[:3 * PER_PERIOD + 1]
+        note = f"A sine of {wording.number(curve['period'])} s."
+    elif all(p.get("at") is not None and math.isfinite(p["high"] - p["low"]) for p in parameters):
+        band = [np.interp(x, [p["at"] for p in parameters], [p[bound] for p in parameters]) for bound in ("low", "high")]
+        lines = [Series(x, np.stack(band, axis=1), "corrected", "band")]
+    label = f"force ({curve['unit']})"
+    if curve["factor"]:
+        kind, _, name = curve["factor"].partition(":")
+        label = f"force × sign ({curve['unit']})" if kind == "velocity" else f"force ({curve['unit']}) per control"
+        note = f"Acts times the {'sign of the ' if kind == 'velocity' else ''}{kind} of {name}."
+    return (_box(chart([*lines, Series(x, force, "corrected")], wording.axis_words(curve["variable"]), label,
+                       label="the unknown force")) + (f'<p class="note">{E(note)}</p>' if note else ""))
 
 
 def _residual(residual):
@@ -307,6 +359,7 @@ def _about(diagnosis):
     notes = "".join(f"<li>{E(note)}</li>" for note in summary.get("warnings", []))
     noise = ", ".join(f"{wording.channel_words(name)} {wording.number(value, 2)}" for name, value in summary["noise"].items())
     train, held = (_names(part) for part in (diagnosis.train, diagnosis.held_out))
+    more = ", and unknown_<n>.csv (a force without a name, as a curve)" if unknown_curves(diagnosis) else ""
     return _section("The recordings",
                     f"<p>Fitted: {E(train)}.<br>Held out: {E(held)}.<br>Noise of the sensors (SI): {E(noise)}.</p>",
                     f"<ul>{notes}</ul>" if notes else "",

@@ -9,6 +9,7 @@ import numpy as np
 SPOKEN = {"coulomb": "Coulomb", "stribeck": "Stribeck", "back_emf": "back-EMF", "center_of_mass": "centre of mass"}
 ALWAYS_THERE = {"center_of_mass", "gravity", "ground_height", "link_length"}  # a nominal 0 of theirs is a value like any other
 MUCH = 0.5  # of the squared error above the noise: no match, though nothing is named
+NEVER = 1e6  # rad or m: a joint stop that far away is none
 SMALL = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}  # errors and noise are small: in these they read better
 
 
@@ -64,25 +65,40 @@ def finding_words(finding):
         on = depends_words(finding.get("depends_on"))
         return (f"{place}: a force that the catalogue has no name for{f', depending on {on}' if on else ''}"
                 + when_words(finding.get("when")))
-    parameters = [p for p in finding["parameters"] if math.isfinite(p["value"])]  # a stop may be on one side only
+    parameters, ends = finding["parameters"], ""
+    absent = [p for p in parameters if no_stop(p["name"], p["value"]) and no_stop(p["name"], p["nominal"])]
+    if absent and len(absent) < len(parameters):  # a stop on one side only
+        ends = " (" + " and ".join(no_stop(p["name"], p["value"]) for p in absent) + ")"
+    parameters = [p for p in parameters if p not in absent]
     parameters = [p for p in parameters if p["value"] != p["nominal"]] or parameters
     if not parameters:
         return f"{place}: {effect}"
     if parameters[0]["nominal"] in (0, None, math.inf, -math.inf) and finding["effect"] not in ALWAYS_THERE:
-        values = ", ".join((f"{p['name']} " if len(parameters) > 1 else "") + estimate(p) for p in parameters)
-        sentence = f"{place}: {effect} {values} was left out"
+        many = len(finding["parameters"]) > 1
+        values = ", ".join(no_stop(p["name"], p["value"]) or (f"{p['name']} " if many else "") + estimate(p) for p in parameters)
+        sentence = f"{place}: {effect} {values} was left out{ends}"
     else:
         named = len(parameters) > 1 or parameters[0]["name"] not in effect
-        values = ", ".join((f"{p['name']} " if named else "") + change(p) for p in parameters)
-        sentence = f"{place}: {effect}{':' if values[0].isalpha() else ''} {values}"
+        values = ", ".join((f"{p['name']} " if named and not no_stop(p["name"], p["value"]) else "") + change(p)
+                           for p in parameters)
+        sentence = f"{place}: {effect}{':' if values[0].isalpha() else ''} {values}{ends}"
     return sentence + when_words(finding.get("when"))
+
+
+def no_stop(name, value):
+    """"no stop below" or "no stop above" of a joint stop's bound that is out of reach, else None."""
+    if name in ("low", "high") and (value is None or not abs(value) < NEVER):
+        return f"no stop {'below' if name == 'low' else 'above'}"
+    return None
 
 
 def change(parameter):
     """"4.52 ± 0.03 kg instead of 3.56 (+27 %)"."""
-    nominal = parameter["nominal"]
+    nominal, stop = parameter["nominal"], no_stop(parameter["name"], parameter["value"])
     if nominal is None or math.isinf(nominal):
-        return estimate(parameter)
+        return stop or estimate(parameter)
+    if stop:
+        return f"{stop} instead of {number(nominal)} {parameter['unit']}"
     ratio = parameter["value"] / nominal if nominal else 1.0
     share = "" if not nominal else f" ({ratio:.0f} times)" if ratio >= 10 else f" ({100 * (ratio - 1):+.0f} %)"
     return f"{estimate(parameter)} instead of {number(nominal)}{share}"
@@ -107,18 +123,25 @@ def depends_words(depends_on):
 
 
 def errors(summary):
-    """Held-out error as words (before, after, floor, unit, place): in SI at the channel that the correction betters
-    most, or, where they are the same, which is farthest from a perfect one; or over all channels in multiples of the noise."""
+    """Held-out error (before, after, floor, unit, place), three numbers and two texts: in SI at the channel that the
+    correction betters most, or, where they are the same, which is farthest from a perfect one; or over all channels in
+    multiples of the noise. Infinite: the model blows up."""
     fit, place, factor = summary["fit"]["held_out"], "", 1
     unit = "times the noise"
-    channels = {name: c for name, c in (fit.get("channels") or {}).items() if c["floor"]}
+    channels = {name: _infinite(c) for name, c in (fit.get("channels") or {}).items() if c["floor"]}
     if channels:
         match = summary["verdict"] == "match"
         gains = {name: (c["before"] if match else c["before"] - c["after"]) / c["floor"] for name, c in channels.items()}
         name = max(gains, key=lambda n: np.nan_to_num(gains[n]))
         fit, place = channels[name], " at " + channel_words(name)
         unit, factor = SMALL.get(fit["unit"], (fit["unit"], 1))
-    return *(number(fit[key] * factor, 2) for key in ("before", "after", "floor")), unit, place
+    fit = _infinite(fit)
+    return *(fit[key] * factor for key in ("before", "after", "floor")), unit, place
+
+
+def _infinite(fit):
+    """Errors with infinity where diagnosis.json has null."""
+    return {**fit, **{key: math.inf if fit[key] is None else fit[key] for key in ("before", "after", "floor")}}
 
 
 def channel_words(name):
@@ -130,18 +153,25 @@ def channel_words(name):
 
 def error_words(summary):
     """"held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; a perfect simulator's would be 1, from noise in ..."."""
-    before, after, floor, unit, place = errors(summary)
+    *values, unit, place = errors(summary)
+    (before, after, floor), blown = (number(value, 2) for value in values), [not math.isfinite(value) for value in values[:2]]
     ahead = f"held-out error {summary['fit']['held_out'].get('horizon_s', 0.3):g} s ahead"
-    fit = summary["fit"]["held_out"]
+    fit, perfect = _infinite(summary["fit"]["held_out"]), f"a perfect simulator would show {floor}, for it too starts from noisy measurements"
+    if all(blown):
+        return f"{ahead} has no number, for the {'' if summary['verdict'] == 'match' else 'corrected '}model blows up{place}; {perfect}"
+    if blown[1]:
+        return f"{ahead} is {before} {unit}{place} with the nominal model, but the corrected one blows up; {perfect}"
+    if blown[0]:
+        return f"{ahead} is {after} {unit}{place}, where the nominal model blows up; {perfect}"
     change = (f"is {before} {unit}" if summary["verdict"] == "match" else f"stays at {after} {unit}" if before == after else
               f"{'falls' if fit['after'] < fit['before'] else 'goes'} from {before} to {after} {unit}")
-    return f"{ahead} {change}{place}; a perfect simulator would show {floor}, for it too starts from noisy measurements"
+    return f"{ahead} {change}{place}; {perfect}"
 
 
 def unexplained_words(summary):
     """What is left over, in a sentence, or "" where nothing worth saying is."""
     left = summary.get("unexplained") or {}
-    if not left.get("fraction") or left["fraction"] < 0.02:
+    if not (left.get("fraction") or 0) >= 0.02:
         return ""
     at = f" at {place_words(left['place'])}" if left.get("place") else ""
     on = depends_words(left.get("depends_on"))
@@ -161,8 +191,8 @@ def verdict_words(summary):
     return "One thing is wrong with the simulator." if count == 1 else f"{count} things are wrong with the simulator."
 
 
-def terminal(summary, out):
-    """The summary for the terminal, several lines."""
+def terminal(summary, out, files):
+    """The summary for the terminal, several lines; the last names the files written into folder out."""
     lines = [verdict_words(summary)]
     for finding in summary["findings"]:
         lines.append(f"  {finding_words(finding)}")
@@ -175,7 +205,7 @@ def terminal(summary, out):
     warnings = summary.get("warnings", [])
     lines += [f"Note: {warning}" for warning in warnings[:8]]
     lines += [f"({len(warnings) - 8} more notes are in the report)"] if len(warnings) > 8 else []
-    lines.append(f"Written: {out}/report.html, diagnosis.json, corrected.xml")
+    lines.append(f"Written: {out}/{', '.join(files)}")
     return "\n".join(lines)
 
 

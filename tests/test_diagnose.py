@@ -16,6 +16,7 @@ import evidence
 import wording
 from recordings import Recording, RecordingError
 from tests.malformed import ARM, cases, run, text
+from tests.test_report import contract
 from world import World
 
 CASES = cases()
@@ -169,6 +170,7 @@ def test_the_command_names_the_friction(command):
     assert done.returncode == 0 and done.stderr == "", done.stderr  # no terminal, no progress
     assert "joint pivot: Coulomb friction 0.15" in done.stdout and "was left out" in done.stdout
     assert "Held-out error 0.3 s ahead falls from" in done.stdout
+    assert done.stdout.endswith("Written: report/report.html, diagnosis.json, corrected.xml\n")
     assert sorted(os.listdir(folder)) == ["report", "run0.csv", "run1.csv", "run2.csv", "sim.xml"]
     assert {"corrected.xml", "diagnosis.json", "report.html"} <= set(os.listdir(folder / "report"))
 
@@ -176,6 +178,7 @@ def test_the_command_names_the_friction(command):
 def test_the_files_of_the_command(command):
     folder, _ = command
     summary = json.loads((folder / "report/diagnosis.json").read_text(), parse_constant=pytest.fail)
+    contract(summary)
     first = summary["findings"][0]
     assert (first["effect"], first["place"]) == ("coulomb_friction", {"kind": "joint", "name": "pivot"})
     assert abs(first["parameters"][0]["value"] - 0.15) < 0.15 * 0.05
@@ -230,11 +233,12 @@ def test_patterns_that_the_shell_left_are_expanded(tmp_path, monkeypatch):
 def test_a_terminal_that_cannot_show_a_sign(command):
     folder, _ = command
     done = subprocess.run([sys.executable, "-c", "import sys; sys.path.insert(0, sys.argv[1]); import diagnose, types, json; "
-                           "s = json.load(open('report/diagnosis.json')); diagnose.report.write = lambda *a: None; "
+                           "s = json.load(open('report/diagnosis.json')); diagnose.report.write = lambda *a: ['unknown_1.csv']; "
                            "diagnose.diagnose = lambda *a: types.SimpleNamespace(summary=s); "
                            "sys.exit(diagnose.main(['--model', 'sim.xml', '--recordings', 'run0.csv', '--out', 'x']))", ROOT],
                           capture_output=True, cwd=folder, env={**os.environ, "PYTHONIOENCODING": "ascii"})
     assert done.returncode == 0 and b"Coulomb friction 0.15" in done.stdout and done.stderr == b"", done.stderr
+    assert done.stdout.endswith(b"Written: x/unknown_1.csv\n")
 
 
 # --- words ---
@@ -276,14 +280,24 @@ def test_error_in_words():
     assert wording.error_words(summary) == ("held-out error 0.3 s ahead falls from 31 to 2.0 mrad at elbow; "
                                             "a perfect simulator would show 1.0, for it too starts from noisy measurements")
     fit["channels"] = {"qpos:1:rot": {**fit["channels"]["qpos:elbow"], "before": float("inf")}}
-    assert "falls from ∞ to 2.0 mrad at joint 1 (rotation);" in wording.error_words(summary)
+    assert "ahead is 2.0 mrad at joint 1 (rotation), where the nominal model blows up;" in wording.error_words(summary)
+    fit["channels"]["qpos:1:rot"]["after"] = None  # as diagnosis.json has it
+    assert "has no number, for the corrected model blows up at joint 1 (rotation);" in wording.error_words(summary)
+    fit["channels"]["qpos:1:rot"]["before"] = 0.031
+    assert "is 31 mrad at joint 1 (rotation) with the nominal model, but the corrected one blows up;" in wording.error_words(summary)
+    assert wording.unexplained_words({"verdict": "mismatch", "unexplained": {"fraction": float("nan")}}) == ""
     del fit["channels"]
     assert "falls from 31 to 2.0 times the noise" in wording.error_words(summary)
 
 
 def test_a_stop_on_one_side():
     never, stop = parameter("low", -np.inf, -np.inf, 0.0, "rad"), parameter("high", np.inf, 0.5, 0.01, "rad")
-    assert wording.finding_words(finding("joint_stop", "joint", "elbow", never, stop)) == "joint elbow: joint stop 0.500 ± 0.010 rad was left out"
+    assert wording.finding_words(finding("joint_stop", "joint", "elbow", never, stop)) == (
+        "joint elbow: joint stop high 0.500 ± 0.010 rad was left out (no stop below)")
+    gone = parameter("high", 1.2, 1e6, 0.0, "rad")  # the nominal model has one, the real joint none
+    kept = parameter("low", -1.2, -1.2, 0.0, "rad")
+    assert wording.finding_words(finding("joint_stop", "joint", "elbow", kept, gone)) == (
+        "joint elbow: joint stop: no stop above instead of 1.20 rad")
 
 
 def test_a_match_far_above_the_noise_says_so():

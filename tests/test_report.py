@@ -1,5 +1,6 @@
 """The report: JSON against the contract's schema, whole files or none, and the page in a real browser."""
 import errno
+import itertools
 import json
 import os
 import re
@@ -16,15 +17,19 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+import curves
 import drawing
 import experiments
 import figures
-import curves
+import findings
 import leftover
 import motion
 import report
+import wording
+from physics import EFFECTS
 from recordings import Recording
 from tests.malformed import ARM, arm, run
+from world import World
 
 BROWSER = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if path), None)
 
@@ -62,8 +67,8 @@ def diagnosis():
                {"effect": "wind", "place": {"kind": "world", "name": "world"}, "error_removed": float("nan"), "p_value": float("nan")}]
     knots, force = np.linspace(-1, 1, 9), np.linspace(0, 1, 9)
     findings.append({**finding("unknown", "joint", "shoulder", 0, 0, 1, "", depends_on=["position:elbow"]),
-                     "parameters": [{"name": f"force {k}", "nominal": 0.0, "value": f, "low": f - 0.1, "high": f + 0.1, "unit": "N·m"}
-                                    for k, f in enumerate(force)]})
+                     "parameters": [{"name": f"force {k}", "nominal": 0.0, "value": f, "low": f - 0.1, "high": f + 0.1, "unit": "N·m", "at": x}
+                                    for k, (x, f) in enumerate(zip(knots, force))]})
     return types.SimpleNamespace(
         summary=summary, corrected_xml=ARM.replace('range="-2.9', 'frictionloss="0.12" range="-2.9'), world=types.SimpleNamespace(model=arm()),
         settings={curves.curve(arm(), "shoulder", "position:elbow", knots): force}, ranking=ranking, traces=traces,
@@ -144,16 +149,59 @@ def test_json_is_strict():
 
 def test_three_files_and_the_unknown_curve(diagnosis, tmp_path):
     out = tmp_path / "a/b/report"
-    report.write(diagnosis, out)
+    assert report.write(diagnosis, out) == ["report.html", "diagnosis.json", "corrected.xml", "unknown_1.csv"]
     assert sorted(os.listdir(out)) == ["corrected.xml", "diagnosis.json", "report.html", "unknown_1.csv"]
     assert (out / "corrected.xml").read_text() == diagnosis.corrected_xml
-    assert np.loadtxt(out / "unknown_1.csv", delimiter=",", skiprows=1).shape == (9, 2)
     mask = os.umask(0)
     os.umask(mask)
     assert stat.S_IMODE(os.stat(out / "report.html").st_mode) == 0o666 & ~mask
-    (out / "unknown_7.csv").write_text("of an earlier diagnosis")
     report.write(diagnosis, out)  # again, over the old ones
-    assert len(os.listdir(out)) == 4 and "unknown_7.csv" not in os.listdir(out)
+    assert len(os.listdir(out)) == 4
+
+
+def test_only_own_curves_are_removed(diagnosis, tmp_path):
+    """A user's recordings may have any name; what an earlier diagnosis here saved goes with it."""
+    for name in ("unknown_1.csv", "unknown_load.csv", "unknown_7.csv"):
+        (tmp_path / name).write_text("recorded")
+    report.write(diagnosis, tmp_path)
+    assert strict(tmp_path / "diagnosis.json")["findings"][3]["saved_as"] == "unknown_2.csv"
+    report.write(diagnosis, tmp_path)
+    assert "unknown_3.csv" not in os.listdir(tmp_path)
+    diagnosis.summary["findings"].pop()
+    report.write(diagnosis, tmp_path)
+    assert {name for name in os.listdir(tmp_path) if name.startswith("unknown")} == {"unknown_1.csv", "unknown_load.csv", "unknown_7.csv"}
+    assert all((tmp_path / name).read_text() == "recorded" for name in ("unknown_1.csv", "unknown_load.csv", "unknown_7.csv"))
+    for rubbish in ("[]", "not JSON", '{"findings": [{"saved_as": "../run.csv"}, {"saved_as": "unknown_load.csv"}, 3]}'):
+        (tmp_path / "diagnosis.json").write_text(rubbish)
+        report.write(diagnosis, tmp_path)
+    assert (tmp_path / "unknown_load.csv").exists()
+
+
+@pytest.mark.parametrize("variable, factor, wave, knots, header", [
+    ("position:elbow", None, False, (-1.0, -0.2, 0.9), "position:elbow,force"),
+    ("position:elbow", "velocity:shoulder", False, (-1.0, -0.2, 0.9), "position:elbow,sign(velocity:shoulder),force"),
+    ("time", "control:elbow_motor", False, (0.0, 1.0, 3.0), "time,control:elbow_motor,force"),
+    ("time", None, True, (0.0, 0.2), "time,force")])
+def test_a_saved_curve_is_the_force_that_is_simulated(diagnosis, tmp_path, variable, factor, wave, knots, header):
+    """The force that the engine applies in the shoulder, at random states, from the rows of the file alone."""
+    model, rng = arm(), np.random.default_rng(0)
+    candidate = curves.curve(model, "shoulder", variable, knots, factor, wave)
+    values = rng.normal(size=len(knots))
+    diagnosis.settings = {candidate: values}
+    report.write(diagnosis, tmp_path)
+    assert (tmp_path / "unknown_1.csv").read_text().splitlines()[0] == header
+    rows = np.loadtxt(tmp_path / "unknown_1.csv", delimiter=",", skiprows=1)
+    force = candidate.effect.force([model], 0, values[None])
+    for _ in range(50):
+        (q, v, u), t = rng.uniform(-0.9, 0.9, (3, 1, 2)), rng.uniform(0, 2.9)
+        x, times = (t if variable == "time" else q[0, 1]), {"": 1.0, "v": np.sign(v[0, 0]), "c": u[0, 1]}[(factor or "")[:1]]
+        some = rows[rows[:, 1] == 1] if factor else rows
+        expected = force(q, v, u, np.array([t]))[0, 0]
+        np.testing.assert_allclose(times * np.interp(x, some[:, 0], some[:, -1]), expected, atol=0.01 if wave else 1e-7)
+        if factor:
+            np.testing.assert_allclose(rows[rows[:, 1] == -1, -1], -some[:, -1])
+    page = report.html_page(diagnosis)
+    assert ("Acts times the" in page) == bool(factor) and ("A sine of 0.800 s" in page) == wave
 
 
 @pytest.mark.parametrize("fails", ["fsync", "replace"])
@@ -316,11 +364,23 @@ def test_rows_before_a_held_out_tail_are_not_drawn(diagnosis):
     assert f"Held out: {whole.name} from 1.50 s on." in report.html_page(diagnosis)
 
 
-def test_every_pair_of_rivals_has_an_experiment():
+def test_the_experiment_for_two_rivals():
     rival = {"effect": "lag", "place": {"kind": "actuator", "name": "drive"}}
     line, = experiments.advice([{"effect": "delay", "place": {"kind": "actuator", "name": "drive"}, "also_possible": [rival]},
                                 {"effect": "mass", "place": {"kind": "body", "name": "torso"}, "also_possible": []}])
     assert line.startswith("Delay of actuator drive or lag of actuator drive: drive with a sine")
+
+
+def test_every_listed_pair_of_rivals_has_an_experiment_of_its_own():
+    """Whichever of the two is the finding; and every effect of the table is one of the catalogue."""
+    known = {effect.name for effect in EFFECTS}
+    for effects, way in experiments.SEPARATING:
+        assert effects <= known, effects - known
+        for one, other in itertools.permutations(effects, 2):
+            lines = [experiments.advice([{"effect": a, "place": {"kind": "body", "name": "x"},
+                                          "also_possible": [{"effect": b, "place": {"kind": "body", "name": "x"}}]}])[0]
+                     for a, b in ((one, other), (other, one))]
+            assert lines[0].split(": ", 1)[1] == lines[1].split(": ", 1)[1] and experiments.OTHERWISE not in lines[0]
 
 
 # --- the page ---
@@ -360,6 +420,33 @@ def test_page_says_it_all(diagnosis):
     for words in ("joint elbow: Coulomb friction 0.120 ± 0.004 N·m was left out", "dead zone", "push the joint by hand with the actuator off",
                   "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "force (N·m)", "a force that the catalogue has no name for", "force left at elbow (N·m)", "badmark"):
         assert words in page, words
+
+
+def test_a_stop_on_one_side_and_a_model_that_blows_up(diagnosis, tmp_path):
+    """JSON keeps numbers where the contract has them; page and terminal say it in words."""
+    stop = finding("joint_stop", "joint", "elbow", 0.0, 0.0, 0.0, "rad", parameters=[
+        {"name": "low", "nominal": -np.inf, "value": -1e6, "low": -1e6, "high": -1e6, "unit": "rad"},
+        {"name": "high", "nominal": np.inf, "value": 0.5, "low": 0.49, "high": 0.51, "unit": "rad"}])
+    held = diagnosis.summary["fit"]["held_out"]
+    diagnosis.summary["findings"] = [stop]
+    held["before"], held["channels"]["qpos:elbow"]["before"] = np.inf, np.inf
+    report.write(diagnosis, tmp_path)
+    written = strict(tmp_path / "diagnosis.json")
+    assert written["findings"][0]["parameters"][0]["value"] == -1e6 and written["fit"]["held_out"]["before"] is None
+    conforms(written["findings"], SCHEMA["findings"])
+    page = (tmp_path / "report.html").read_text()
+    assert "joint stop high 0.500 ± 0.010 rad was left out (no stop below)" in page and "<td>no stop below</td>" in page
+    assert "is 2.0 mrad at elbow, where the nominal model blows up" in page and "1000000" not in page and "nan %" not in page
+    assert "the nominal model blows up" in wording.terminal(written, "out", ["report.html"])
+
+
+def test_findings_tell_where_a_curve_has_its_knots_and_keep_numbers():
+    stop, curve = World(mujoco.MjSpec.from_string(ARM)).candidate("joint_stop", "shoulder"), curves.curve(arm(), "elbow", "time", (0.0, 2.0, 3.0))
+    assert [p["at"] for p in findings.parameters_of(curve, (1.0, 2.0, 3.0))] == [0.0, 2.0, 3.0]
+    assert [p["value"] for p in findings.parameters_of(stop, (-np.inf, 0.5))] == [-1e6, 0.5]
+    inf = np.inf
+    assert [findings.removed(*errors) for errors in ((3, 1, 4), (inf, 1, inf), (inf, 1, 4), (3, inf, 4), (inf, inf, inf))] == [0.5, 1, 1, -1, 0]
+    assert [findings.unexplained(*errors) for errors in ((10, 1, 1), (inf, inf, 1), (inf, 2, 1), (2, inf, 1))] == [0, 1, 0, 1]
 
 
 def test_page_of_a_match_claims_nothing(matched):
