@@ -1,0 +1,50 @@
+"""A recording clock that runs wrong: recordings of stock MuJoCo whose times are multiplied afterwards."""
+from dataclasses import replace
+import re
+
+import mujoco
+import numpy as np
+import pytest
+
+import clock
+import misfit
+import shooting
+import windows as cut
+from tests.test_identify import NOISE, PENDULUM, recorded
+from world import World
+
+DAMPING = 0.15  # N·m·s/rad, of the real pendulum
+
+
+def fitted(ratio, effects):
+    """(problem, fit of these effects): the real pendulum only has more damping, and its recording's time is `ratio` times true."""
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    run = recorded("run.csv", 0, damping=DAMPING)
+    problem = misfit.Problem(world, cut.consecutive(replace(run, time=run.time * ratio), 0.4), np.array([NOISE]), np.array([np.inf]))
+    hypothesis = misfit.Hypothesis()
+    for effect, place in effects:
+        candidate = world.candidate(effect, place)
+        hypothesis = hypothesis.plus(candidate, candidate.nominal)
+    [fit] = shooting.solve(problem, [hypothesis], shooting.fit_starts(problem, misfit.Hypothesis()))
+    return problem, fit
+
+
+FOUR = [("viscous_damping", "pivot"), ("inertia", "arm"), ("gain", "drive"), ("bias", "drive")]
+
+
+@pytest.mark.parametrize("ratio, way", [(1.04, "fast"), (0.97, "slow")])
+def test_a_wrong_clock_is_told(ratio, way):
+    """Damping's true value and the true clock leave the noise alone; the note gives the clock's error to a per cent."""
+    problem, fit = fitted(ratio, FOUR)
+    damping = fit.hypothesis.candidates[0]
+    truth = misfit.Hypothesis().plus(damping, (DAMPING,))
+    assert clock.left(problem, 1 / ratio, truth) < 1.3 * problem.rows < 0.1 * clock.left(problem, 1.0, truth)
+    note = clock.suspect(problem, fit, damping)
+    percent, said = re.search(r"seems to run ([\d.]+)% (\w+)", note).groups()
+    assert said == way and abs(float(percent) - 100 * abs(ratio - 1)) < 1.0 and "\n" not in note
+
+
+@pytest.mark.parametrize("ratio, effects", [(1.0, FOUR), (1.04, FOUR[:3])])
+def test_a_right_clock_and_few_findings_are_left_alone(ratio, effects):
+    problem, fit = fitted(ratio, effects)
+    assert clock.suspect(problem, fit, fit.hypothesis.candidates[0]) is None
