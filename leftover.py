@@ -49,7 +49,8 @@ def forces(model, qpos, qvel, qacc, ctrl):
 
 
 def residuals(diagnosis, most=1200):
-    """One dict per finding that can be drawn: finding (index), variable, x, before, after (n,), unit, x_unit."""
+    """One dict per finding that can be drawn: finding (index), variable, x, before, after (n,), unit, x_unit. after: under
+    corrected.xml; NaN for a finding that it cannot hold."""
     nominal = diagnosis.world.model
     corrected = mujoco.MjModel.from_xml_string(diagnosis.corrected_xml)
     measured = [r.seen() for r in diagnosis.held_out if not np.isnan(r.qpos).all(axis=0).any()]
@@ -63,13 +64,14 @@ def residuals(diagnosis, most=1200):
     after = forces(corrected, *states) if same else np.full_like(before, np.nan)
     found = []
     for index, finding in enumerate(diagnosis.summary["findings"]):
+        held = after if finding["written_as"] == "mjcf" else np.full_like(after, np.nan)
         for variable in finding["depends_on"][:2]:
             x, joint, unit = _variable(nominal, variable, time, *states)
             joint = _joint_of(nominal, finding["place"], joint)
             if x is None or joint is None:
                 continue
             hinge, dof = nominal.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE, nominal.jnt_dofadr[joint]
-            found.append({"finding": index, "variable": variable, "x": x, "before": before[:, dof], "after": after[:, dof],
+            found.append({"finding": index, "variable": variable, "x": x, "before": before[:, dof], "after": held[:, dof],
                           "unit": "N·m" if hinge else "N", "x_unit": unit, "joint": nominal.joint(joint).name or str(joint)})
     return found
 

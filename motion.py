@@ -84,8 +84,8 @@ def overlay(diagnosis):
     rows = np.unique(np.linspace(0, last - first, min(FRAMES, last - first + 1)).astype(int))
     motions = {"measured": whole(nominal, recording.qpos[first:last + 1])}
     motions.update({look: simulate(model, recording, first, last, columns) for look, (model, columns) in models.items()})
-    if not diagnosis.settings:
-        del motions["corrected"]
+    if not any(finding["written_as"] == "mjcf" for finding in diagnosis.summary["findings"]):
+        del motions["corrected"]  # it is the nominal one
     for look, qpos in motions.items():  # a simulation that blew up stays where it was last
         for k in range(1, len(qpos)):
             qpos[k] = np.where(np.isnan(qpos[k]), qpos[k - 1], qpos[k])

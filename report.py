@@ -178,11 +178,11 @@ def _mechanism(diagnosis):
     film = ""
     if moving:
         recording, start, seconds, motions = moving
-        note = (f"{recording} from {wording.number(start)} s: both models start from the recorded state and are driven by the "
-                f"recorded control for {wording.number(seconds, 2)} s. Of the held-out stretches, the one where the nominal "
+        note = (f"{recording} from {wording.number(start)} s: from the recorded state, driven by the recorded control for "
+                f"{wording.number(seconds, 2)} s. Of the held-out stretches, the one where the nominal "
                 "model errs most.")
         film = (drawing.animation(model, motions, seconds) + f'<p class="note">{E(note)}</p>'
-                + _legend(("measured", "recorded"), ("nominal", "nominal"), ("corrected", "corrected")))
+                + _legend(*((look, "recorded" if look == "measured" else look) for look in motions)))
     return _section("The mechanism", _pair(_box(picture), film))
 
 
@@ -273,7 +273,8 @@ def _residual(residual):
                      Series(*binned(x, before), "nominal"), Series(*binned(x, after), "corrected")],
                     wording.axis_words(residual["variable"], residual["x_unit"]), f"force left at {residual['joint']} ({unit})",
                     label="residual against " + residual["variable"])
-    legend = _legend(("nominal", "left over by the nominal model"), ("corrected", "by the corrected one"))
+    corrected = [("corrected", "by the corrected one")] if np.isfinite(after).any() else []
+    legend = _legend(("nominal", "left over by the nominal model"), *corrected)
     return picture and legend + _box(picture)
 
 

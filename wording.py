@@ -132,7 +132,7 @@ def errors(summary):
     if channels:
         match = summary["verdict"] == "match"
         gains = {name: (c["before"] if match else c["before"] - c["after"]) / c["floor"] for name, c in channels.items()}
-        name = max(gains, key=lambda n: np.nan_to_num(gains[n]))
+        name = max(gains, key=lambda n: (math.isinf(channels[n]["after"]), np.nan_to_num(gains[n])))
         fit, place = channels[name], " at " + channel_words(name)
         unit, factor = SMALL.get(fit["unit"], (fit["unit"], 1))
     fit = _infinite(fit)
@@ -154,15 +154,18 @@ def channel_words(name):
 def error_words(summary):
     """"held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; a perfect simulator's would be 1, from noise in ..."."""
     *values, unit, place = errors(summary)
-    (before, after, floor), blown = (number(value, 2) for value in values), [not math.isfinite(value) for value in values[:2]]
+    before, after, floor = (number(value, 2) for value in values)
+    blown = [not math.isfinite(value) for value in values[:2]]
     ahead = f"held-out error {summary['fit']['held_out'].get('horizon_s', 0.3):g} s ahead"
-    fit, perfect = _infinite(summary["fit"]["held_out"]), f"a perfect simulator would show {floor}, for it too starts from noisy measurements"
+    perfect = f"a perfect simulator would show {floor}, for it too starts from noisy measurements"
     if all(blown):
-        return f"{ahead} has no number, for the {'' if summary['verdict'] == 'match' else 'corrected '}model blows up{place}; {perfect}"
+        which = "" if summary["verdict"] == "match" else "corrected "
+        return f"{ahead} has no number, for the {which}model blows up{place}; {perfect}"
     if blown[1]:
         return f"{ahead} is {before} {unit}{place} with the nominal model, but the corrected one blows up; {perfect}"
     if blown[0]:
         return f"{ahead} is {after} {unit}{place}, where the nominal model blows up; {perfect}"
+    fit = _infinite(summary["fit"]["held_out"])
     change = (f"is {before} {unit}" if summary["verdict"] == "match" else f"stays at {after} {unit}" if before == after else
               f"{'falls' if fit['after'] < fit['before'] else 'goes'} from {before} to {after} {unit}")
     return f"{ahead} {change}{place}; {perfect}"

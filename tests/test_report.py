@@ -364,6 +364,13 @@ def test_rows_before_a_held_out_tail_are_not_drawn(diagnosis):
     assert f"Held out: {whole.name} from 1.50 s on." in report.html_page(diagnosis)
 
 
+def test_what_the_corrected_file_cannot_hold_is_not_drawn_as_corrected(diagnosis):
+    diagnosis.summary["findings"] = [{**diagnosis.summary["findings"][0], "written_as": "none"}]
+    assert all(np.isnan(r["after"]).all() and np.isfinite(r["before"]).all() for r in leftover.residuals(diagnosis))
+    assert set(motion.overlay(diagnosis)[3]) == {"measured", "nominal"}
+    assert "by the corrected one" not in report.html_page(diagnosis)
+
+
 def test_the_experiment_for_two_rivals():
     rival = {"effect": "lag", "place": {"kind": "actuator", "name": "drive"}}
     line, = experiments.advice([{"effect": "delay", "place": {"kind": "actuator", "name": "drive"}, "also_possible": [rival]},
