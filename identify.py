@@ -96,7 +96,9 @@ def searched(data, say):
         say(0.1 + 0.15 * i, f"searching {len(world.candidates)} candidates in {longer:.2g} s windows")
         search, fit, before = sought(world, train, problem_of(*data, longer, SEARCH_STEPS), hypothesis)
         span = longer
-        if not i and fit.chi2.sum() > max(MUCH * search.problem.rows, UNFOUND * before):
+        # in few rows even a small part of what an unstable mechanism first missed is much
+        share = UNFOUND if sum(len(r.time) for r in train) > FEW_ROWS else 0.0
+        if not i and fit.chi2.sum() > max(MUCH * search.problem.rows, share * before):
             say(0.15, f"searching {len(world.candidates)} candidates in {longer / 3:.2g} s windows")
             other, less, _ = sought(world, train, problem_of(*data, longer / 3, SEARCH_STEPS), hypothesis)
             [again] = shooting.solve(other.problem, [fit.hypothesis], less)

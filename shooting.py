@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from misfit import Fit
-from observer import observed
+from observer import far_apart, observed
 
 UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a parameter counts as without effect
 GOOD = 0.5  # share of the fall of the squared residual that a Jacobian promised, from which on it is kept
@@ -42,10 +42,12 @@ def fit_starts(problem, hypothesis, iterations=12, sharp=True):
         fit = fit_starts(problem, hypothesis, iterations, sharp=False)
         begun = jacobian(fit.qpos, fit.qvel, fit.residual)
     else:
-        starts = (problem.guess_qpos, problem.guess_qvel), observed(problem.world, problem.windows, hypothesis.settings)
+        starts = [(problem.guess_qpos, problem.guess_qvel)]
+        if far_apart(problem.windows):
+            starts.append(observed(problem.world, problem.windows, hypothesis.settings))
         tried = [(*start, problem.residuals(settings, every, *start)) for start in starts]
-        better = (tried[1][2] ** 2).sum(1) < (tried[0][2] ** 2).sum(1)
-        begun = jacobian(*(np.where(better[:, None], new, old) for old, new in zip(*tried)))
+        best = np.argmin([(residual**2).sum(1) for *_, residual in tried], axis=0)
+        begun = jacobian(*(np.stack(parts)[best, every] for parts in zip(*tried)))
     [fit] = _fit_starts(problem, [begun], 2 if sharp else iterations, fresh=True)
     if problem.key:
         kept[key] = fit
