@@ -35,9 +35,19 @@ class Unknown(JointEffect):
         force = self.unit(model, i, 'N·m', 'N')
         return tuple(Parameter(f'force {k}', force, 0.0, -HUGE * M, HUGE * M, 0.05 * M) for k in range(len(self.knots)))
 
+    def at(self, x, values):
+        """The curve at x (n,), before its factor, with values (n, k) at the knots of each: (n,)."""
+        knots, rows = np.array(self.knots), np.arange(len(x))
+        if self.wave:
+            turn = np.pi / 2 * (x - knots[0]) / (knots[1] - knots[0])
+            return values[:, 0] * np.cos(turn) + values[:, 1] * np.sin(turn)
+        k = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
+        f = np.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0)
+        return (1 - f) * values[rows, k] + f * values[rows, k + 1]
+
     def force(self, models, i, values):
-        model, knots = models[0], np.array(self.knots)
-        d, rows = model.jnt_dofadr[i], np.arange(len(values))
+        model = models[0]
+        d = model.jnt_dofadr[i]
 
         def read(variable, qpos, qvel, ctrl, time):
             kind, _, name = variable.partition(':')
@@ -50,13 +60,7 @@ class Unknown(JointEffect):
 
         def curve(*state):
             x, out = read(self.variable, *state), np.zeros_like(state[1])
-            if self.wave:
-                turn = np.pi / 2 * (x - knots[0]) / (knots[1] - knots[0])
-                out[:, d] = values[:, 0] * np.cos(turn) + values[:, 1] * np.sin(turn)
-            else:
-                k = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
-                f = np.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0)
-                out[:, d] = (1 - f) * values[rows, k] + f * values[rows, k + 1]
+            out[:, d] = self.at(x, values)
             if self.factor:
                 y = read(self.factor, *state)
                 out[:, d] *= np.sign(y) if self.factor.startswith('velocity') else y

@@ -147,7 +147,7 @@ def noise_of(world, train):
 def lowered_noise(world, train, position, velocity, hypothesis):
     """Noise (nv,), (nv,) as given, or less where a model leaves less of short windows."""
     model = world.model
-    sample = np.median([np.median(np.diff(r.time)) for r in train])
+    sample = cut.sampling(train)
     problem = problem_of(world, train, position, velocity, None, LEAST_ROWS * sample, SEARCH_STEPS)
     fit, weight = shooting.fit_starts(problem, hypothesis, sharp=False), problem.weight
     gap = fit.residual[:, :weight[0].size].reshape(weight.shape) / np.where(weight > 0, weight, 1)
@@ -199,7 +199,7 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
     Up to LONGEST (or a few dozen rows) while the residual is a few noises; where recordings are far more precise than
     any model, longer windows only add nonlinearity, and half the reported horizon is enough.
     """
-    sample = np.median([np.median(np.diff(r.time)) for r in train])
+    sample = cut.sampling(train)
     duration = np.median([np.ptp(r.time) for r in train])
     shortest = max(LEAST_ROWS * sample, at_least)
     if sum(len(r.time) for r in train) < FEW_ROWS:  # too little to be cut
@@ -241,7 +241,7 @@ def anything_left(data, search, hypothesis):
     them, and much more than they do without it.
     """
     hint, best = None, None
-    shortest = LEAST_ROWS * np.median([np.median(np.diff(r.time)) for r in data[1]])
+    shortest = LEAST_ROWS * cut.sampling(data[1])
     spans = sorted({max(span, shortest) for span in LEFTOVER_SPANS}, reverse=True)
     for problem in [search.problem] + [problem_of(*data, span, SEARCH_STEPS) for span in spans]:
         fit = shooting.fit_starts(problem, hypothesis)

@@ -90,7 +90,7 @@ class Problem:
         self.weight[~np.isfinite(self.weight)] = 0.0
         self.guess_qpos, self.guess_qvel = cut.recorded_starts(self.model, self.windows)
         # Wide priors on the start states: they only decide what the measurements leave open.
-        sample = np.median([np.median(np.diff(w.recording.time)) for w in self.windows])
+        sample = cut.sampling(w.recording for w in self.windows)
         speed = np.sqrt(np.mean(self.guess_qvel**2, axis=0)) + 1e-3
         finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
         self.start_scale = np.concatenate([np.where(finite > 0, 20 * finite, 1.0),

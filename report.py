@@ -235,11 +235,9 @@ def unknown_curves(diagnosis):
                     period = 4 * (effect.knots[1] - effect.knots[0])
                     times = np.concatenate([r.time for r in [*diagnosis.train, *diagnosis.held_out]])
                     x = np.arange(times.min(), times.max() + period / PER_PERIOD, period / PER_PERIOD)
-                    turn = 2 * np.pi * (x - effect.knots[0]) / period
-                    force = values[0] * np.cos(turn) + values[1] * np.sin(turn)
                 else:
                     x = np.union1d(effect.knots, np.linspace(effect.knots[0], effect.knots[-1], PER_CURVE))
-                    force = np.interp(x, effect.knots, values)
+                force = effect.at(x, np.tile(values, (len(x), 1)))
                 curves.append({"finding": index, "variable": effect.variable, "factor": effect.factor, "period": period,
                                "x": x, "force": force, "unit": candidate.parameters[0].unit})
     return curves

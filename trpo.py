@@ -96,7 +96,7 @@ def fisher_product(policy, obs, damping):
     each log sigma: what the Hessian of KL(pi || pi_theta) at theta = pi comes to (its gradient is 0 there). J' u is
     linear in u, so differentiating it by u gives J v, and F is never formed.
     """
-    weights, log_std = list(policy.net.parameters()), policy.log_std.detach()
+    weights, log_std = list(policy.net.parameters()), policy.log_std.detach()  # in parameters() log_std comes first
     sizes = [len(log_std), *(w.numel() for w in weights)]
     mean = policy.mean(obs)
     u = torch.zeros_like(mean, requires_grad=True)

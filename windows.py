@@ -80,6 +80,11 @@ def integrate(model, qpos, step):
     return out
 
 
+def sampling(recordings):
+    """Usual time between the rows of recordings, s."""
+    return np.median([np.median(np.diff(r.time)) for r in recordings])
+
+
 def joint_name(model, joint):
     return model.joint(joint).name or str(joint)
 

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
+from joints import JointStop
+
 SPOKEN = {"coulomb": "Coulomb", "stribeck": "Stribeck", "back_emf": "back-EMF", "center_of_mass": "centre of mass"}
 ALWAYS_THERE = {"center_of_mass", "gravity", "ground_height", "link_length"}  # a nominal 0 of theirs is a value like any other
 MUCH = 0.5  # of the squared error above the noise: no match, though nothing is named
-NEVER = 1e6  # rad or m: a joint stop that far away is none
 SMALL = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}  # errors and noise are small: in these they read better
 
 
@@ -87,7 +88,7 @@ def finding_words(finding):
 
 def no_stop(name, value):
     """"no stop below" or "no stop above" of a joint stop's bound that is out of reach, else None."""
-    if name in ("low", "high") and (value is None or not abs(value) < NEVER):
+    if name in ("low", "high") and (value is None or not abs(value) < JointStop.NEVER):
         return f"no stop {'below' if name == 'low' else 'above'}"
     return None
 
