@@ -9,7 +9,6 @@ The error is the contract's (windows.error): consecutive windows, start as recor
 import numpy as np
 
 import misfit
-import scores
 import shooting
 import windows as cut
 
@@ -28,34 +27,6 @@ def prediction_error(world, settings, recordings, noise, horizon=cut.HORIZON):
     """(error over all channels in noises, {channel: error in SI})."""
     windows = consecutive(recordings, horizon)
     return cut.error(world.model, windows, predict(world, settings, windows)[0], noise)
-
-
-def crossed(search, fit, windows, position_noise):
-    """Reported error of windows, before and after, each predicted with the values that the other recordings say.
-
-    Where there is but one recording: the other thirds of it. The values without some are one step from the fit's.
-    """
-    recordings = list({id(w.recording): w.recording for w in [*search.problem.windows, *windows]}.values())
-
-    def block(w):
-        if len(recordings) > 1:
-            return next(i for i, r in enumerate(recordings) if r is w.recording)
-        return min(3 * w.first // len(w.recording.time), 2)
-
-    slope, moves = search.slopes(fit)
-    scan, owner = shooting.project(search.problem, fit, slope), np.array([block(w) for w in search.problem.windows])
-    low, high = (np.array([getattr(p, bound) for p in fit.hypothesis.parameters]) for bound in ("low", "high"))
-    noise, square = reporting_noise(position_noise), np.zeros(2)
-    for b in np.unique([block(w) for w in windows]):
-        others, mine = owner != b, [w for w in windows if block(w) == b]
-        if not others.any():
-            continue
-        shift = scores.elsewhere(scan.gram.sum(0), scan.gram[~others].sum(0), scan.score[others].sum(0))
-        moved = fit.hypothesis.moved(np.clip(fit.hypothesis.vector + moves * shift, low, high)).settings
-        for k, settings in enumerate(({}, moved)):
-            error, _ = cut.error(search.model, mine, predict(search.world, settings, mine)[0], noise)
-            square[k] += len(mine) * error**2
-    return np.sqrt(square)
 
 
 def floor_error(world, settings, recordings, position_noise, velocity_noise):

@@ -18,13 +18,13 @@ import numpy as np
 
 import clock
 import events
-import evidence
 import findings
 import misfit
 import selection
 import shooting
 import unknown
 import windows as cut
+from earning import earned
 from recordings import RecordingError
 
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
@@ -33,7 +33,6 @@ LEAST_ROWS, LEAST_WINDOWS, FEW_ROWS = 8, 20, 100
 LEFTOVER_SPANS = 0.2, 0.1  # s
 MOST = 0.7  # share of the squared residual, that a leftover explains, above which no shorter windows are asked
 STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up to which the curve does without them
-WORSE = 0.02  # of the reported error: more is no accident
 GROSS = 5.0  # residual of a window over the usual one, that it may count for
 MUCH, UNFOUND = 4.0, 0.05  # squared residual, over the noise's and the nominal model's, above which shorter windows are tried
 ROUNDS = 3  # of search, each with longer windows
@@ -68,7 +67,7 @@ def identify(world, train, held_out, progress=None):
     if hypothesis.effects:
         [fit] = shooting.solve(final.problem, [hypothesis], fit)
         fit = final.drop(fit, ())
-        fit = generalising(final, fit, windows_for(world, train, cut.HORIZON, FINAL_STEPS, event), position_noise)
+        fit = earned(final, fit, windows_for(world, train, cut.HORIZON, FINAL_STEPS, event), position_noise)
         hypothesis = fit.hypothesis
     if left and left.candidate not in hypothesis.candidates:
         left, hint = None, left
@@ -287,15 +286,3 @@ def named_instead(search, fit, curve):
         return None
     [new] = shooting.solve(search.problem, [near[0].hypothesis], fit)
     return new.hypothesis if new.chi2.sum() < (1 + selection.WORTH) * fit.chi2.sum() else None
-
-
-def generalising(search, fit, windows, position_noise):
-    """The fit without the effects that predict what they were not fitted to worse than the nominal model does."""
-    while fit.hypothesis.effects:
-        before, after = evidence.crossed(search, fit, windows, position_noise)
-        if not after > (1 + WORSE) * before:
-            break
-        # what only stands in for something else goes first
-        weakest = max(fit.hypothesis.candidates, key=lambda c: (c.effect.name == "unknown", search.significance(fit, c)[0]))
-        [fit] = shooting.solve(search.problem, [fit.hypothesis.minus(weakest)], fit)
-    return fit

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+import earning
 import evidence
 import findings
 import misfit
@@ -162,15 +163,45 @@ def test_every_other_position_still_has_probes_for_friction():
     np.testing.assert_allclose(world.probes(candidate, [run]), whole, rtol=0.1)
 
 
-def test_crossed_takes_windows_of_recordings_that_the_search_did_not_see():
+def test_values_for_windows_are_those_that_other_recordings_say():
     runs = [recorded(f"run{k}.csv", k, damping=0.08) for k in range(4)]
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
-    noise = np.array([NOISE])
+    noise, windows = np.array([NOISE]), [w for r in runs[1:] for w in cut.consecutive(r, 0.3)]
     problem = misfit.Problem(world, [w for r in runs[:3] for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
     damping = world.candidate("viscous_damping", "pivot")
     [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(damping, (0.06,))], shooting.fit_starts(problem, misfit.Hypothesis()))
-    before, after = evidence.crossed(selection.Search(world, problem, runs), fit, evidence.consecutive(runs[1:], 0.3), noise)
+    settings = earning.elsewhere(selection.Search(world, problem, runs), fit, windows)
+    for w, s in zip(windows, settings):
+        others = misfit.Problem(world, [v for r in runs[:3] if r is not w.recording for v in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
+        [alone] = shooting.solve(others, [fit.hypothesis], shooting.fit_starts(others, fit.hypothesis))
+        assert s[damping][0] == pytest.approx(alone.hypothesis.vector[0], rel=0.01)
+    before, after = (earning.overall(earning.squares(world, s, windows, noise)) for s in ([{}] * len(windows), settings))
     assert after < 0.5 * before
+    assert after == pytest.approx(evidence.prediction_error(world, fit.hypothesis.settings, runs[1:], noise)[0], rel=0.02)
+
+
+def test_an_effect_that_does_not_predict_other_recordings_better_goes():
+    runs = [recorded(f"run{k}.csv", k, damping=0.08) for k in range(4)]
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    noise, windows = np.array([NOISE]), [w for r in runs for w in cut.consecutive(r, 0.3)]
+    problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
+    damping, air = world.candidate("viscous_damping", "pivot"), world.candidate("air_drag", "world")
+    both = misfit.Hypothesis().plus(damping, (0.06,)).plus(air, (50.0,))
+    [fit] = shooting.solve(problem, [both], shooting.fit_starts(problem, misfit.Hypothesis()))
+    search = selection.Search(world, problem, runs)
+    search.freedom = 1  # as where the model is far from the noise
+    assert earning.earned(search, fit, windows, noise).hypothesis.candidates == (damping,)
+
+
+def test_scatter_of_errors_between_recordings_is_students():
+    rng, runs = np.random.default_rng(1), [SimpleNamespace(time=np.arange(9.0)) for _ in range(14)]
+    windows = [cut.Window(r, 0, 8) for r in runs]
+    one, other = rng.uniform(1, 2, (2, 14)) * 8
+    rise, bound, _ = earning.scatter(windows, (one, np.full(14, 8)), (other, np.full(14, 8)))
+    each = np.sqrt(other / 8) - np.sqrt(one / 8)
+    assert rise == pytest.approx(each.sum()) and bound == pytest.approx(1.7709 * each.std(ddof=1) * np.sqrt(14), rel=1e-3)
+    other[3] = np.inf  # a window that blows up counts for ten of the worst
+    assert earning.scatter(windows, (one, np.full(14, 8)), (other, np.full(14, 8)))[0] > rise + 8 * np.sqrt(1)
 
 
 def test_what_a_motor_at_a_site_depends_on_is_no_joint():

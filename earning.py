@@ -1,0 +1,103 @@
+"""Does every effect earn its keep? The reported error of recordings that a fit was not made from, with it and without it.
+
+    fit = earned(search, fit, windows, position_noise)      # without the effects that do not
+
+The search judges by windows whose start states are fitted, where a small effect shows best. Where that model reaches the
+noise it is to be trusted; where it does not, an effect may only bend towards another that is missing, and has to show
+in the reported error too, by more than that scatters between recordings or stretches of them.
+"""
+
+import numpy as np
+
+import evidence
+import misfit
+import scores
+import shooting
+import windows as cut
+from selection import FAR
+
+WORSE, SLIGHT = 0.02, 0.01  # of the reported error: more is no accident; less is not worth an effect
+LEVEL = 0.95  # of Student's t, one-sided, beyond which a difference is more than scatter
+CAP = 10.0  # times the largest finite error of a window, that one which blows up counts for
+
+
+def earned(search, fit, windows, position_noise):
+    """The fit without the effects that are not worth having for predicting, dropped one at a time, the others refitted."""
+    noise = evidence.reporting_noise(position_noise)
+    while fit.hypothesis.effects:
+        candidates = fit.hypothesis.candidates
+        before, after = (squares(search.world, s, windows, noise) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
+        if not overall(after) > (1 + WORSE) * overall(before):
+            gains = [scatter(windows, after, less) for less in (absent(search, fit, windows, noise) if len(candidates) > 1 else [before])]
+            far = fit.chi2.sum() > FAR * search.freedom
+            weak = [i for i, (gain, bound, whole) in enumerate(gains) if not gain > (max(bound, SLIGHT * whole) if far else -bound)]
+            if not weak:
+                break
+            gone = candidates[min(weak, key=lambda i: gains[i][0] / max(gains[i][1], 1e-300))]
+        else:  # what only stands in for something else goes first
+            gone = max(candidates, key=lambda c: (c.effect.name == "unknown", search.significance(fit, c)[0]))
+        fit = search.without(fit, gone)
+    return fit
+
+
+def scatter(windows, one, other):
+    """(by how much the sum of windows' errors, each (squares (W,), counts (W,)), rises from one to the other, by how much that
+    may be scatter between clusters of them, the sum of one)."""
+    errors = np.sqrt([square / np.maximum(count, 1) for square, count in (one, other)])  # (2, W)
+    finite = errors[np.isfinite(errors)]
+    errors = np.minimum(errors, CAP * finite.max() if len(finite) else 1.0)
+    rise = scores.summed(scores.clusters(windows), errors[1] - errors[0])
+    if len(rise) < 2:
+        return rise.sum(), 0.0, errors[0].sum()
+    return rise.sum(), scores.t_quantile(len(rise) - 1, LEVEL) * np.sqrt(len(rise)) * rise.std(ddof=1), errors[0].sum()
+
+
+def absent(search, fit, windows, noise):
+    """[squares] of windows without each effect of a fit, the others refitted: on few windows first, where that is far."""
+    shorter = [fit.hypothesis.minus(c) for c in fit.hypothesis.candidates]
+    near = shooting.solve(search.small, shorter, fit.subset(search.few), iterations=4)
+    fits = shooting.solve(search.problem, [f.hypothesis for f in near], fit, iterations=1)
+    return [squares(search.world, [f.hypothesis.settings] * len(windows), windows, noise) for f in fits]
+
+
+def elsewhere(search, fit, windows):
+    """Settings for each of windows: a fit's values as the other recordings say, one step from it.
+
+    Where there is but one recording: as its other thirds say.
+    """
+    recordings = list({id(w.recording): w.recording for w in [*search.problem.windows, *windows]}.values())
+
+    def block(w):
+        if len(recordings) > 1:
+            return next(i for i, r in enumerate(recordings) if r is w.recording)
+        return min(3 * w.first // len(w.recording.time), 2)
+
+    slope, moves = search.slopes(fit)
+    scan, owner = shooting.project(search.problem, fit, slope), np.array([block(w) for w in search.problem.windows])
+    low, high = (np.array([getattr(p, bound) for p in fit.hypothesis.parameters]) for bound in ("low", "high"))
+    settings = {}
+    for b in {block(w) for w in windows}:
+        others = owner != b
+        shift = scores.elsewhere(scan.gram.sum(0), scan.gram[~others].sum(0), scan.score[others].sum(0)) if others.any() else 0.0
+        settings[b] = fit.hypothesis.moved(np.clip(fit.hypothesis.vector + moves * shift, low, high)).settings
+    return [settings[block(w)] for w in windows]
+
+
+def squares(world, settings, windows, noise):
+    """(squared error in noises summed over the rows of each window (W,), number of rows that count (W,)), starts as recorded.
+
+    settings: one for each window.
+    """
+    predicted = world.simulate(settings, *cut.recorded_starts(world.model, windows), windows)[0]
+    residual = cut.position_residual(world.model, windows, predicted)[:, 1:]
+    measured = cut.measured(windows)[:, 1:]
+    known = np.isfinite(cut.difference(world.model, measured, measured))
+    with np.errstate(invalid="ignore", over="ignore"):
+        square = np.where(known, np.where(np.isfinite(residual), residual / noise, np.inf) ** 2, 0.0)
+    return square.sum((1, 2)), known.sum((1, 2))
+
+
+def overall(parts):
+    """The error of all windows."""
+    square, count = parts
+    return float(np.sqrt(square.sum() / max(count.sum(), 1)))
