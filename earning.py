@@ -53,11 +53,15 @@ def scatter(windows, one, other):
 
 
 def absent(search, fit, windows, noise):
-    """[squares] of windows without each effect of a fit, the others refitted: on few windows first, where that is far."""
-    shorter = [fit.hypothesis.minus(c) for c in fit.hypothesis.candidates]
-    near = shooting.solve(search.small, shorter, fit.subset(search.few), iterations=4)
-    fits = shooting.solve(search.problem, [f.hypothesis for f in near], fit, iterations=1)
+    """[squares] of windows without each effect of a fit, the others refitted."""
+    fits = refitted(search, fit, [fit.hypothesis.minus(c) for c in fit.hypothesis.candidates])
     return [squares(search.world, [f.hypothesis.settings] * len(windows), windows, noise) for f in fits]
+
+
+def refitted(search, fit, hypotheses):
+    """Hypotheses near that of a fit, refitted: on few windows first, where that is far."""
+    near = shooting.solve(search.small, hypotheses, fit.subset(search.few), iterations=4)
+    return shooting.solve(search.problem, [f.hypothesis for f in near], fit, iterations=1)
 
 
 def elsewhere(search, fit, windows):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+import earning
 import evidence
 import scores
 import selection
@@ -16,6 +17,7 @@ import shooting
 import windows as cut
 
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
+NEAR = 0.3  # so near they have to come before they are refitted
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
             "evidence": {"held_out_error_removed": removed(without, after, before),
                          "p_value": search.significance(fit, candidate)[0]},
             "depends_on": list(left.variables) if curve else depends_on(model, candidate), "when": None, "written_as": written[candidate],
-            "also_possible": also_possible(world, train, noise, fit.hypothesis, candidate, possible.get(candidate, [])),
+            "also_possible": also_possible(search, fit, train, noise, candidate, possible.get(candidate, [])),
             **({"curve": form} if curve else {})})
     if event:
         findings.append(event_finding(event, train))
@@ -173,14 +175,19 @@ def depends_on(model, candidate):
     return [f"{variable}:{name}"] if variable else []
 
 
-def also_possible(world, train, noise, hypothesis, candidate, others, most=3):
-    """The alternatives that leave the reported error, on the data they were fitted to, within 5 % of the finding's."""
-    windows = evidence.consecutive(train, cut.HORIZON)
+def also_possible(search, fit, train, noise, candidate, others, most=3):
+    """The alternatives [(error ratio, candidate, values)] that leave the reported error, on the data they were fitted to,
+    within 5 % of the finding's; refitted, the other findings with them, where they come near."""
+    windows, world, rest = evidence.consecutive(train, cut.HORIZON), search.world, fit.hypothesis.minus(candidate)
     windows = windows[:: -(-len(windows) // 60)]
-    rms = lambda settings: cut.error(world.model, windows, evidence.predict(world, settings, windows)[0], noise)[0]
-    out, best = [], rms(hypothesis.settings) if others else 0.0
-    for _, other, values in others:
-        if len(out) < most and rms(hypothesis.minus(candidate).plus(other, values).settings) < (1 + SAME) * best:
+    rms = lambda h: cut.error(world.model, windows, evidence.predict(world, h.settings, windows)[0], noise)[0]
+    stood = [rest.plus(other, values) for _, other, values in others if other not in fit.hypothesis.candidates]
+    best = rms(fit.hypothesis) if stood else 0.0
+    near = [h for h in stood if rms(h) < (1 + NEAR) * best][:most + 1]
+    out = []
+    for f in earning.refitted(search, fit, near):
+        other, values = f.hypothesis.effects[-1]
+        if len(out) < most and rms(f.hypothesis) < (1 + SAME) * best:
             out.append({"effect": other.effect.name, "place": place_of(other), "parameters": parameters_of(other, values)})
     return out
 

@@ -59,7 +59,7 @@ def identify(world, train, held_out, progress=None):
     fit, possible = search.settle(fit)
     hypothesis = fit.hypothesis
     say(0.75, "testing for anything left")
-    hypothesis, left, hint = anything_left(data, search, hypothesis)
+    hypothesis, left, hint, possible = anything_left(data, search, hypothesis, possible)
     hypothesis = misfit.Hypothesis(tuple((c, c.effect.canonical(values)) for c, values in hypothesis.effects))
     say(0.8, "intervals")
     problem, fit = bounded(problem_of(*data, span, FINAL_STEPS), hypothesis)
@@ -97,12 +97,17 @@ def searched(data, say):
         span = longer
         # in few rows even a small part of what an unstable mechanism first missed is much
         share = UNFOUND if sum(len(r.time) for r in train) > FEW_ROWS else 0.0
-        if not i and fit.chi2.sum() > max(MUCH * search.problem.rows, share * before):
-            say(0.15, f"searching {len(world.candidates)} candidates in {longer / 3:.2g} s windows")
-            other, less, _ = sought(world, train, problem_of(*data, longer / 3, SEARCH_STEPS), hypothesis)
+        shorter = span
+        while not i and fit.chi2.sum() > max(MUCH * search.problem.rows, share * before) and shorter > LEAST_ROWS * cut.sampling(train):
+            shorter /= 3
+            say(0.15, f"searching {len(world.candidates)} candidates in {shorter:.2g} s windows")
+            other, less, _ = sought(world, train, problem_of(*data, shorter, SEARCH_STEPS), hypothesis)
             [again] = shooting.solve(other.problem, [fit.hypothesis], less)
-            if not fit.hypothesis.effects or less.chi2.sum() < (1 - selection.WORTH) * again.chi2.sum():
-                search, fit, span = other, less, longer / 3
+            better = not fit.hypothesis.effects or less.chi2.sum() < (1 - selection.WORTH) * again.chi2.sum()
+            if less.hypothesis.effects and better:
+                search, fit, span = other, less, shorter
+            if fit.hypothesis.effects:
+                break
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     return search, fit, ranking, span
@@ -233,10 +238,10 @@ def happened(data, hypothesis):
     return min(found, key=lambda e: e.left) if found else None
 
 
-def anything_left(data, search, hypothesis):
-    """(hypothesis, large Leftover or None, small one or None): what the residual depends on.
+def anything_left(data, search, hypothesis, possible):
+    """(hypothesis, large Leftover or None, small one or None, what else is possible): what the residual depends on.
 
-    Named effects that only stood in for it go, all of them or one after the other: where it explains as much without
+    possible: {candidate: [(error ratio, other candidate, values), ...]}, as settle returns it. Named effects that only stood in for it go, all of them or one after the other: where it explains as much without
     them, and much more than they do without it.
     """
     hint, best = None, None
@@ -255,7 +260,7 @@ def anything_left(data, search, hypothesis):
         if best and best[0].share > MOST:
             break
     if best is None:
-        return hypothesis, None, hint
+        return hypothesis, None, hint, possible
     found, problem, fit, bare = best
     curve, named = found.candidate, fit.chi2.sum()
     [fit] = shooting.solve(problem, [hypothesis.plus(curve, curve.nominal)], fit)
@@ -268,21 +273,24 @@ def anything_left(data, search, hypothesis):
             if less.chi2.sum() < rest + min(STAND_IN * (bare.chi2.sum() - rest), 0.5 * (named - rest)):
                 fit = less
     if not found.large and len(fit.hypothesis.effects) > 1:  # it counts only in the place of all
-        return hypothesis, None, hint
+        return hypothesis, None, hint, possible
     local = selection.Search(search.world, problem, search.recordings)
     local.kept = search.kept
-    renamed = named_instead(local, fit, curve)
+    renamed, others = named_instead(local, fit, curve)
     if renamed:
-        return renamed, None, None
-    fit, _ = local.settle(fit, but=(curve,))  # beside the curve others may look likelier
-    return fit.hypothesis, found, None
+        return renamed, None, None, {**possible, **others}
+    fit, settled = local.settle(fit, but=(curve,))  # beside the curve others may look likelier
+    return fit.hypothesis, found, None, {**settled, **others}
 
 
 def named_instead(search, fit, curve):
-    """The hypothesis with an effect of the catalogue in a curve's place, if one leaves no more than the curve; else None."""
-    others, _ = search.alternatives(fit, fit.subset(search.few), curve)
-    near = min(others, key=lambda o: o[0].chi2.sum(), default=None)
-    if near is None or near[0].chi2.sum() > (1 + selection.WORTH) * fit.chi2[search.few].sum():
-        return None
-    [new] = shooting.solve(search.problem, [near[0].hypothesis], fit)
-    return new.hypothesis if new.chi2.sum() < (1 + selection.WORTH) * fit.chi2.sum() else None
+    """(the hypothesis with an effect of the catalogue in a curve's place, if one leaves no more than the curve, else None;
+    {that effect, or the curve: [(error ratio, other candidate, values), ...]})."""
+    small = fit.subset(search.few)
+    others = sorted(search.alternatives(fit, small, curve)[0], key=lambda o: o[0].chi2.sum())
+    listed = [(float(np.sqrt(f.chi2.sum() / small.chi2.sum())), c, f.hypothesis.settings[c]) for f, c in others]
+    if others and others[0][0].chi2.sum() <= (1 + selection.WORTH) * small.chi2.sum():
+        [new] = shooting.solve(search.problem, [others[0][0].hypothesis], fit)
+        if new.chi2.sum() < (1 + selection.WORTH) * fit.chi2.sum():
+            return new.hypothesis, {others[0][1]: listed[1:]}
+    return None, {curve: listed}

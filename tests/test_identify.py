@@ -193,6 +193,21 @@ def test_an_effect_that_does_not_predict_other_recordings_better_goes():
     assert earning.earned(search, fit, windows, noise).hypothesis.candidates == (damping,)
 
 
+def test_alternatives_are_refitted_and_listed_where_they_predict_as_well():
+    runs = [recorded(f"run{k}.csv", k, damping=0.08, push=lambda time, qpos, qvel: 0.03) for k in range(3)]
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    noise = np.array([NOISE])
+    problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
+    damping, offset, bias, gain = (world.candidate(*c) for c in (("viscous_damping", "pivot"), ("spring_offset", "pivot"),
+                                                                 ("bias", "drive"), ("gain", "drive")))
+    true = misfit.Hypothesis().plus(damping, (0.08,)).plus(offset, (0.03,))
+    [fit] = shooting.solve(problem, [true], shooting.fit_starts(problem, misfit.Hypothesis()))
+    others = [(1.0, gain, (1.01,)), (1.1, bias, (0.027,))]  # as few windows see them
+    only, = findings.also_possible(selection.Search(world, problem, runs), fit, runs, noise, offset, others)
+    assert (only["effect"], only["place"]["name"]) == ("bias", "drive")
+    assert only["parameters"][0]["value"] == pytest.approx(0.03, rel=0.02)  # the motor has no gear: the same torque
+
+
 def test_scatter_of_errors_between_recordings_is_students():
     rng, runs = np.random.default_rng(1), [SimpleNamespace(time=np.arange(9.0)) for _ in range(14)]
     windows = [cut.Window(r, 0, 8) for r in runs]
