@@ -18,6 +18,9 @@ import windows as cut
 
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
 NEAR = 0.3  # so near they have to come before they are refitted
+# of an unknown force's largest: up to which it counts as none, up to which its interval must lie outside its region;
+# of the recorded range: a region that covers more is no part of it
+FAINT, SMALL, PART = 0.25, 0.4, 0.75
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,8 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
             "parameters": parameters_of(candidate, values, bounds[candidate]),
             "evidence": {"held_out_error_removed": removed(without, after, before),
                          "p_value": search.significance(fit, candidate)[0]},
-            "depends_on": list(left.variables) if curve else depends_on(model, candidate), "when": None, "written_as": written[candidate],
+            "depends_on": list(left.variables) if curve else depends_on(model, candidate),
+            "when": region(candidate.effect, values, bounds[candidate], travel(model, train, candidate)) if curve else None, "written_as": written[candidate],
             "also_possible": also_possible(search, fit, train, noise, candidate, possible.get(candidate, [])),
             **({"curve": form} if curve else {})})
     if event:
@@ -122,6 +126,39 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
                                "depends_on": list(hint.variables) if hint else []}}
     return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
                      train, held)
+
+
+def region(effect, values, bounds, travelled):
+    """Where an unknown force acts, as {"qpos:<joint>" or "qvel:<joint>": [from, to]}; None where it acts everywhere, or where
+    that cannot be said. travelled: (least, most) recorded of what it depends on.
+
+    It acts between the knots at which its 95 % interval leaves out zero, and, since it is linear in between, on to the next
+    knots; beyond the last it goes on as there. At the others it must be known to be small, or nothing is said.
+    """
+    kind, _, name = effect.variable.partition(":")
+    if effect.wave or kind not in ("position", "velocity"):
+        return None
+    knots, size, (low, high) = np.array(effect.knots), np.abs(values), np.array(bounds, float).T
+    acts = np.flatnonzero(((low > 0) | (high < 0)) & (size > FAINT * size.max()))
+    if not len(acts):
+        return None
+    outside = np.r_[:acts[0], acts[-1] + 1:len(knots)]
+    begin = knots[acts[0] - 1] if acts[0] else travelled[0]
+    end = knots[acts[-1] + 1] if acts[-1] + 1 < len(knots) else travelled[1]
+    known = (np.maximum(-low, high)[outside] < SMALL * size.max()).all()
+    if not known or end - begin > PART * (travelled[1] - travelled[0]):
+        return None
+    return {f"{'qpos' if kind == 'position' else 'qvel'}:{name}": [float(begin), float(end)]}
+
+
+def travel(model, train, curve):
+    """(least, most) recorded of the position or velocity that a curve depends on, but for a few odd rows; None of others."""
+    kind, _, name = curve.effect.variable.partition(":")
+    if kind not in ("position", "velocity"):
+        return None
+    joint, which = model.joint(name), kind == "velocity"
+    column = (joint.qposadr, joint.dofadr)[which][0]
+    return np.quantile(np.concatenate([cut.states(model, r)[which][:, column] for r in train]), (0.001, 0.999))
 
 
 def event_finding(event, train):

@@ -111,7 +111,13 @@ def when_words(when):
         return ""
     if "time" in when:
         return f", in {when['recording']} from {number(when['time'][0])} to {number(when['time'][1])} s"
-    return ", where " + " and ".join(f"{name} is between {number(a)} and {number(b)}" for name, (a, b) in when.items())
+    return ", where " + " and ".join(f"{state_words(name)} is between {number(a)} and {number(b)}" for name, (a, b) in when.items())
+
+
+def state_words(name):
+    """"qpos:elbow" -> "the position of elbow"."""
+    kind, _, joint = name.partition(":")
+    return {"qpos": "the position of ", "qvel": "the velocity of "}[kind] + joint
 
 
 def depends_words(depends_on):

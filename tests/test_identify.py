@@ -322,6 +322,37 @@ def test_what_no_catalogue_knows_is_called_unknown():
     diagnosis = diagnosed(push=lambda time, q, v: -0.4 * np.sin(5 * q) * (q > 0))
     found = [f for f in diagnosis.summary["findings"] if f["effect"] == "unknown"]
     assert found and found[0]["place"]["name"] == "pivot" and "position:pivot" in found[0]["depends_on"]
+    [(variable, (begin, end))] = found[0]["when"].items()
+    assert variable == "qpos:pivot" and begin == pytest.approx(0, abs=0.1)
+    assert end == pytest.approx(max(r.qpos.max() for r in diagnosis.train), abs=0.05)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=60, deadline=None)
+def test_a_region_holds_all_of_the_force_or_is_not_told(seed):
+    rng = np.random.default_rng(seed)
+    knots = np.sort(rng.uniform(-1, 1, 9))
+    first, count = rng.integers(0, 9), rng.integers(1, 9)
+    values = np.where((np.arange(9) >= first) & (np.arange(9) < first + count), rng.choice([-1, 1]) * rng.uniform(1, 2, 9), 0)
+    bounds = np.stack([values - 0.1, values + 0.1], 1)
+    effect = unknown_force(knots)
+    told = findings.region(effect, values, bounds, (-1.2, 1.2))
+    x = np.linspace(-1.2, 1.2, 2001)
+    acts = np.interp(x, knots, values) != 0
+    if told:
+        [(name, (begin, end))] = told.items()
+        assert name == "qpos:pivot" and end - begin < 0.8 * 2.4
+        assert begin - 2e-3 <= x[acts].min() and x[acts].max() <= end + 2e-3
+        assert begin == pytest.approx(x[acts].min(), abs=3e-3) and end == pytest.approx(x[acts].max(), abs=3e-3)
+    else:
+        assert np.ptp(x[acts]) > 0.74 * 2.4
+    assert findings.region(effect, values, np.stack([values - 5, values + 5], 1), (-1.2, 1.2)) is None  # it may be nothing
+    assert findings.region(unknown_force(knots, "time"), values, bounds, None) is None
+
+
+def unknown_force(knots, variable="position:pivot"):
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    return world.curve("pivot", variable, knots).effect
 
 
 def test_a_push_for_a_while_is_placed_in_time():
