@@ -17,16 +17,63 @@ DEEP, SHALLOW = (64, 64), (4,)  # hidden layers of the paper's two target polici
 LOG_2PI_E = math.log(2 * math.pi * math.e)
 
 
-def mlp(sizes, last_gain=1.0, activation=nn.Tanh):
-    """Fully connected layers of the given sizes; orthogonal weights, the last layer's scaled by last_gain."""
-    layers = []
-    for i, (n_in, n_out) in enumerate(zip(sizes, sizes[1:])):
-        last = i == len(sizes) - 2
-        layer = nn.Linear(n_in, n_out)
-        nn.init.orthogonal_(layer.weight, last_gain if last else math.sqrt(2))
-        nn.init.zeros_(layer.bias)
-        layers += [layer] if last else [layer, activation()]
-    return nn.Sequential(*layers)
+class MLP(nn.Sequential):
+    """Fully connected tanh layers and a linear last one; orthogonal weights, the last layer's scaled by last_gain.
+
+    The derivatives that learning asks for most are written out. Autograd finds the same numbers, bit for bit, but in
+    networks this small its bookkeeping takes as long as the arithmetic.
+    """
+
+    def __init__(self, sizes, last_gain=1.0):
+        layers = []
+        for i, (n_in, n_out) in enumerate(zip(sizes, sizes[1:])):
+            last = i == len(sizes) - 2
+            layer = nn.Linear(n_in, n_out)
+            nn.init.orthogonal_(layer.weight, last_gain if last else math.sqrt(2))
+            nn.init.zeros_(layer.bias)
+            layers += [layer] if last else [layer, nn.Tanh()]
+        super().__init__(*layers)
+        self.linear = layers[::2]
+
+    @torch.no_grad()
+    def values(self, x):
+        """What enters each linear layer, and the network's output: [x, h_1, ..., y], all (N, width)."""
+        values = [x]
+        for layer in self.linear:
+            values.append(torch.addmm(layer.bias, values[-1], layer.weight.t()))
+            if layer is not self.linear[-1]:
+                values[-1].tanh_()
+        return values
+
+    @torch.no_grad()
+    def gradient(self, values, g):
+        """J' g, J the Jacobian of the output by the weights: a list in the order of parameters(). g: (N, outputs)."""
+        found = []
+        for k, layer in reversed(list(enumerate(self.linear))):
+            found = [g.t() @ values[k], g.sum(0), *found]
+            if k:
+                g = torch.ops.aten.tanh_backward(g @ layer.weight, values[k])  # (1 - h^2) times what arrives there
+        return found
+
+    @torch.no_grad()
+    def tangent(self, values, v):
+        """J v, (N, outputs), for v a list of changes of the weights in the order of parameters()."""
+        moved = None
+        for layer, x, weight, bias in zip(self.linear, values, v[::2], v[1::2]):
+            through = torch.addmm(bias, x, weight.t())
+            if moved is not None:
+                through += torch.ops.aten.tanh_backward(moved, x) @ layer.weight.t()
+            moved = through
+        return moved
+
+
+def least_squares_step(net, optimizer, x, y):
+    """One step of an optimizer of net's weights on the mean of (net(x) - y)^2."""
+    values = net.values(x)
+    error = values[-1] - y
+    for weight, gradient in zip(net.parameters(), net.gradient(values, (2 / error.numel()) * error)):
+        weight.grad = gradient
+    optimizer.step()
 
 
 class Normalizer(nn.Module):
@@ -73,7 +120,7 @@ class GaussianPolicy(nn.Module):
         super().__init__()
         self.sizes = (nobs, *hidden, nact)
         self.normalizer = Normalizer(nobs)
-        self.net = mlp(self.sizes, last_gain=0.01)  # starts near mean 0 everywhere
+        self.net = MLP(self.sizes, last_gain=0.01)  # starts near mean 0 everywhere
         self.log_std = nn.Parameter(torch.full((nact,), float(log_std)))
 
     def mean(self, obs):
@@ -87,7 +134,7 @@ class GaussianPolicy(nn.Module):
     @torch.no_grad()
     def act(self, obs, generator=None):
         """A sample for each row of obs: (N, nact)."""
-        mean = self.mean(obs)
+        mean = self.net.values(self.normalizer(obs))[-1]
         return mean + self.log_std.exp() * torch.randn(mean.shape, generator=generator)
 
     def save(self, path):
@@ -144,7 +191,7 @@ class Value(nn.Module):
         super().__init__()
         self.normalizer = Normalizer(nobs)
         self.returns = Normalizer(1)
-        self.net = mlp((nobs, *hidden, 1))
+        self.net = MLP((nobs, *hidden, 1))
 
     def forward(self, obs):
         """Values (N,) of obs (N, nobs), in units of reward."""
@@ -160,7 +207,7 @@ class Regressor(nn.Module):
     def __init__(self, n_in, n_out, hidden=(128, 128)):
         super().__init__()
         self.inputs, self.outputs = Normalizer(n_in), Normalizer(n_out)
-        self.net = mlp((n_in, *hidden, n_out))
+        self.net = MLP((n_in, *hidden, n_out))
 
     def forward(self, x):
         return self.outputs.inverse(self.net(self.inputs(x)))
@@ -182,10 +229,7 @@ class Regressor(nn.Module):
         best, best_state, stale = math.inf, None, 0
         for _ in range(max(1, max_updates * batch_size // len(train))):
             for rows in train[torch.randperm(len(train), generator=generator)].split(batch_size):
-                loss = ((self.net(x[rows]) - target[rows]) ** 2).mean()
-                optimizer.zero_grad()
-                loss.backward()
-                optimizer.step()
+                least_squares_step(self.net, optimizer, x[rows], target[rows])
             with torch.no_grad():
                 error = float(((self.net(x[held]) - target[held]) ** 2).mean())
             stale += 1

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from models import gaussian_entropy, gaussian_kl, gaussian_log_prob
+from models import gaussian_entropy, gaussian_kl, gaussian_log_prob, least_squares_step
 
 
 @dataclass(frozen=True)
@@ -93,20 +93,19 @@ def fisher_product(policy, obs, damping):
     """v -> (F + damping I) v, F the Fisher matrix of the policy at its present parameters, over obs (N, nobs).
 
     For a Gaussian, F is the mean over obs of J' diag(1/sigma^2) J, J the Jacobian of the action's mean, and 2 for
-    each log sigma: what the Hessian of KL(pi || pi_theta) at theta = pi comes to (its gradient is 0 there). J' u is
-    linear in u, so differentiating it by u gives J v, and F is never formed.
+    each log sigma: what the Hessian of KL(pi || pi_theta) at theta = pi comes to (its gradient is 0 there). F is never
+    formed: J v and J' u are found layer by layer.
     """
-    weights, log_std = list(policy.net.parameters()), policy.log_std.detach()  # in parameters() log_std comes first
+    net, log_std = policy.net, policy.log_std.detach()  # in parameters() log_std comes first
+    weights = list(net.parameters())
     sizes = [len(log_std), *(w.numel() for w in weights)]
-    mean = policy.mean(obs)
-    u = torch.zeros_like(mean, requires_grad=True)
-    Jt_u = torch.autograd.grad(mean, weights, u, create_graph=True)
+    values = net.values(policy.normalizer(obs))
     metric = torch.exp(-2 * log_std) / len(obs)
 
     def product(v):
         v_log_std, *v_weights = v.split(sizes)
-        (Jv,) = torch.autograd.grad(Jt_u, u, [x.view_as(w) for x, w in zip(v_weights, weights)], retain_graph=True)
-        Fv = torch.autograd.grad(mean, weights, metric * Jv, retain_graph=True)
+        Jv = net.tangent(values, [x.view_as(w) for x, w in zip(v_weights, weights)])
+        Fv = net.gradient(values, metric * Jv)
         return torch.cat([2 * v_log_std, *(x.reshape(-1) for x in Fv)]) + damping * v
 
     return product
@@ -175,10 +174,7 @@ def value_update(value, optimizer, obs, returns, config, generator):
     def fit():
         for order in orders:
             for x, y in zip(inputs[order].split(config.value_batch), target[order].split(config.value_batch)):
-                loss = ((value.net(x) - y) ** 2).mean()
-                optimizer.zero_grad()
-                loss.backward()
-                optimizer.step()
+                least_squares_step(value.net, optimizer, x, y)
 
     return fit
 
@@ -211,7 +207,7 @@ class TRPO:
 
     def __init__(self, policy, value, config):
         self.policy, self.value, self.config = policy, value, config
-        self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr, foreach=True)  # all weights in one call
+        self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr)
         self.generator = torch.Generator()
 
     def state(self):

@@ -12,6 +12,7 @@ ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 from models import (
     DEEP,
+    MLP,
     SHALLOW,
     ForwardModel,
     GaussianPolicy,
@@ -21,6 +22,7 @@ from models import (
     gaussian_entropy,
     gaussian_kl,
     gaussian_log_prob,
+    least_squares_step,
     load_checkpoint,
 )
 
@@ -69,6 +71,45 @@ def test_the_papers_policies(hidden, count):
     for linear in layers[:-1:2]:
         x = torch.tanh(x @ linear.weight.T + linear.bias)
     torch.testing.assert_close(policy.mean(obs), x @ layers[-1].weight.T + layers[-1].bias)
+
+
+widths = st.lists(st.integers(1, 9), min_size=2, max_size=5)
+
+
+def small_network(seed, widths, rows=7):
+    """A network in double precision, its input, and noise in the shape of each of its weights."""
+    torch.manual_seed(seed)
+    net = MLP(widths).double()
+    for p in net.parameters():
+        p.data += 0.3 * torch.randn_like(p)
+    return net, torch.randn(rows, widths[0], dtype=torch.float64), [torch.randn_like(p) for p in net.parameters()]
+
+
+@given(seeds, widths)
+@settings(max_examples=30, deadline=None)
+def test_written_out_derivatives_equal_autograds(seed, widths):
+    net, x, v = small_network(seed, widths)
+    values, g = net.values(x), torch.randn(len(x), widths[-1], dtype=torch.float64)
+    torch.testing.assert_close(values[-1], net(x).detach())
+    for ours, theirs in zip(net.gradient(values, g), torch.autograd.grad(net(x), list(net.parameters()), g), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    names = [name for name, _ in net.named_parameters()]
+    at = lambda *weights: torch.func.functional_call(net, dict(zip(names, weights)), x)
+    Jv = torch.autograd.functional.jvp(at, tuple(p.detach() for p in net.parameters()), tuple(v))[1]
+    torch.testing.assert_close(net.tangent(values, v), Jv)
+
+
+@given(seeds, widths)
+@settings(max_examples=20, deadline=None)
+def test_a_least_squares_step_is_autograds(seed, widths):
+    nets = [small_network(seed, widths)[0] for _ in range(2)]
+    x, y = torch.randn(11, widths[0], dtype=torch.float64), torch.randn(11, widths[-1], dtype=torch.float64)
+    ours, theirs = (torch.optim.SGD(net.parameters(), lr=0.1) for net in nets)
+    least_squares_step(nets[0], ours, x, y)
+    torch.nn.functional.mse_loss(nets[1](x), y).backward()
+    theirs.step()
+    for a, b in zip(*(net.parameters() for net in nets)):
+        torch.testing.assert_close(a, b)
 
 
 @given(seeds, st.lists(st.integers(1, 40), min_size=1, max_size=6))
