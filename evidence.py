@@ -40,12 +40,12 @@ def floor_error(world, settings, recordings, position_noise, velocity_noise):
     return float(np.sqrt((square / noise**2).sum() / max(known.sum(), 1))), per_channel
 
 
-def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, most=100, seed=0):
-    """What a perfect simulator would miss in at most `most` windows: (W, T, nv), NaN where nothing was measured.
+def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, most=300, draws=4, seed=0):
+    """What a perfect simulator would miss in at most `most` windows: (draws W, T, nv), NaN where nothing was measured.
 
     The corrected model from start states fitted to the first 0.3 s, from one row before each window on, stands for the
     truth. It is measured anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
-    by differences.
+    by differences; `draws` times, for noise alone makes this vary.
     """
     rng, model = np.random.default_rng(seed), world.model
     windows = consecutive(recordings, horizon)
@@ -57,17 +57,19 @@ def floor_gaps(world, settings, recordings, position_noise, velocity_noise, hori
     fit = shooting.fit_starts(problem, misfit.Hypothesis(tuple(settings.items())), sharp=False)
     truth, speed = predict(world, settings, early, (fit.qpos, fit.qvel))
     finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
-    noisy = cut.integrate(model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,)))
     every, at = np.arange(len(windows)), np.array([w.first - e.first for w, e in zip(windows, early)])
     seconds = np.array([w.recording.time[w.first + 1] - w.recording.time[e.first] for w, e in zip(windows, early)])
-    start = cut.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds[:, None]
+    known = np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows)))
     measured = np.array([np.isfinite(w.recording.qvel[w.first]) for w in windows])
-    spread = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0) * rng.normal(size=start.shape)
-    start = np.where(measured, speed[every, at] + spread, start)
-    predicted = predict(world, settings, windows, (noisy[every, at], start))[0]
-    rows = np.minimum(np.arange(predicted.shape[1]) + at[:, None], noisy.shape[1] - 1)
-    gap = cut.difference(model, predicted, noisy[every[:, None], rows])
-    return np.where(np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows))), gap, np.nan)
+    spread, out = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0), []
+    for _ in range(draws):
+        noisy = cut.integrate(model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,)))
+        start = cut.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds[:, None]
+        start = np.where(measured, speed[every, at] + spread * rng.normal(size=start.shape), start)
+        predicted = predict(world, settings, windows, (noisy[every, at], start))[0]
+        rows = np.minimum(np.arange(predicted.shape[1]) + at[:, None], noisy.shape[1] - 1)
+        out.append(np.where(known, cut.difference(model, predicted, noisy[every[:, None], rows]), np.nan))
+    return np.concatenate(out)
 
 
 def reporting_noise(position_noise):
@@ -76,20 +78,30 @@ def reporting_noise(position_noise):
 
 
 def curve(world, settings, recordings, position_noise, velocity_noise, longest=3 * cut.HORIZON, points=15):
-    """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t up to `longest`."""
+    """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t up to `longest`.
+
+    Windows in which a prediction blew up before t are left out of its error there and counted, with all that were measured
+    then: "blown_up": {"before":, "after":, "of":}, where there are any.
+    """
     noise = reporting_noise(position_noise)
     windows = consecutive(recordings, longest)
     length = max(w.last - w.first for w in windows) + 1
     rows = np.unique(np.linspace(1, length - 1, min(points, length - 1)).round().astype(int))
     sample = np.median([(w.recording.time[w.last] - w.recording.time[w.first]) / (w.last - w.first) for w in windows])
-    out = [{"seconds": float(r * sample)} for r in rows]
-    gaps = {name: cut.position_residual(world.model, windows, predict(world, s, windows)[0])
-            for name, s in (("before", {}), ("after", settings))}
-    gaps["floor"] = floor_gaps(world, settings, recordings, position_noise, velocity_noise, longest, most=33)
-    for name, gap in gaps.items():
-        with np.errstate(invalid="ignore"):
-            for row, entry in zip(rows, out):
-                entry[name] = _rms(gap[:, row] / noise) if row < gap.shape[1] else None
+    measured = cut.measured(windows)
+    known = np.isfinite(cut.difference(world.model, measured, measured))
+    predicted = {name: predict(world, s, windows)[0] for name, s in (("before", {}), ("after", settings))}
+    gaps = {name: cut.position_residual(world.model, windows, qpos) for name, qpos in predicted.items()}
+    gaps["floor"] = floor_gaps(world, settings, recordings, position_noise, velocity_noise, longest)
+    out = []
+    for row in rows:
+        entry = {"seconds": float(row * sample)}
+        blown = {name: int((known[:, row] & ~np.isfinite(gaps[name][:, row])).any(1).sum()) for name in predicted}
+        if any(blown.values()):
+            entry["blown_up"] = {**blown, "of": int(known[:, row].any(1).sum())}
+        with np.errstate(invalid="ignore", over="ignore"):
+            entry |= {name: _rms(gap[:, row] / noise) if row < gap.shape[1] else None for name, gap in gaps.items()}
+        out.append(entry)
     return out
 
 

@@ -164,9 +164,11 @@ def travel(model, train, curve):
 def event_finding(event, train):
     local = selection.Search(event.problem.world, event.problem, train)
     candidate = event.candidate
+    [without] = shooting.solve(event.problem, [event.fit.hypothesis.minus(candidate)], event.fit)
+    there = removed(*(np.sqrt(f.chi2.sum()) for f in (without, event.fit, without)))
     named = lambda c, values, bounds=None: {"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, values, bounds)}
     return {**named(candidate, event.values, intervals(local, event.fit)[candidate]),
-            "evidence": {"held_out_error_removed": 0.0, "p_value": event.p_value},
+            "evidence": {"held_out_error_removed": 0.0, "error_removed_there": there, "p_value": event.p_value},
             "depends_on": ["time"], "when": event.when, "written_as": "none",
             "also_possible": [named(c, values) for c, values in event.others]}
 

@@ -217,6 +217,7 @@ def _facts(finding):
     for key, value in (finding.get("evidence") or {}).items():
         if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
             facts.append(f"removes {100 * value:.0f} % of the held-out error" if key == "held_out_error_removed" else
+                         f"removes {100 * value:.0f} % of the error around it" if key == "error_removed_there" else
                          f"p {wording.p_value(value)}" if key == "p_value" else
                          f"{key.replace('_', ' ')} {wording.number(value)}")
     return facts + [{"mjcf": "held in corrected.xml", "none": "has no plain MJCF form, so not in corrected.xml",
@@ -288,6 +289,8 @@ def _prediction(diagnosis):
         picture = (_legend(("nominal", "nominal"), ("corrected", "corrected"), *noise)
                    + _box(chart(lines, "horizon (s)", "error (× noise)", log_y=bool(wide), zero=not wide,
                                 label="error against horizon")))
+        worst = max((point["blown_up"] for point in curve if "blown_up" in point), key=lambda b: b["before"] + b["after"], default=None)
+        picture += f'<p class="note">{E(wording.blown_words(worst))}</p>' if worst else ""
     rows = []
     for name, channel in (fit.get("channels") or {}).items():
         unit, factor = wording.SMALL.get(channel["unit"], (channel["unit"], 1))

@@ -178,6 +178,13 @@ def error_words(summary):
     return f"{ahead} {change}{place}; {perfect}"
 
 
+def blown_words(blown):
+    """{"before": 3, "after": 0, "of": 40} -> what the curve of error against horizon leaves out."""
+    parts = [f"{blown[key]} of {blown['of']} windows blow up under the {name} model" for key, name in
+             (("before", "nominal"), ("after", "corrected")) if blown[key]]
+    return sentence(" and ".join(parts) + ": from then on they are left out of its line")
+
+
 def unexplained_words(summary):
     """What is left over, in a sentence, or "" where nothing worth saying is."""
     left = summary.get("unexplained") or {}

@@ -110,6 +110,31 @@ def test_error_is_that_of_stock_mujoco():
     assert channels["qpos:pivot"] == pytest.approx(error * NOISE, rel=1e-9)
 
 
+def test_windows_that_blow_up_are_counted_beside_the_curve():
+    run = recorded("run.csv", 5)
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    true, noise = world.simulate, np.array([NOISE])
+
+    def bursts(settings, qpos, qvel, windows, *more, **options):  # under the correction, in every other window from 0.4 s on
+        out = true(settings, qpos, qvel, windows, *more, **options)
+        out[0][[i for i, w in enumerate(windows) if settings[i] and w.first // 90 % 2], 41:] = np.nan
+        return out
+    world.simulate = bursts
+    mass = {world.candidate("mass", "arm"): (0.5001,)}
+    rows = evidence.curve(world, mass, [run], noise, np.array([np.inf]))
+    assert [row["seconds"] > 0.405 for row in rows] == ["blown_up" in row for row in rows]
+    assert rows[-1]["blown_up"] == {"before": 0, "after": 2, "of": 4}
+    assert all(row["after"] == pytest.approx(row["before"], rel=0.5) for row in rows)
+
+
+def test_floor_is_what_noise_does_to_a_perfect_simulator():
+    xml = PENDULUM.format(damping=0.05, mass=0.5)
+    runs, world = [recorded(f"run{k}.csv", 20 + k, seconds=20.0) for k in range(6)], World(mujoco.MjSpec.from_string(xml))
+    floor, channels = evidence.floor_error(world, {}, runs, np.array([NOISE]), np.array([np.inf]))
+    assert floor == pytest.approx(np.sqrt(np.mean([stock_error(xml, run, NOISE) ** 2 for run in runs])), rel=0.08)
+    assert channels["qpos:pivot"] == pytest.approx(floor * NOISE)
+
+
 def test_noise_of_differences():
     rng, time = np.random.default_rng(0), 0.01 * np.arange(2000)
     x = np.sin(3 * time) + 1e-3 * rng.normal(size=2000)
