@@ -3,6 +3,7 @@ import mujoco
 import numpy as np
 
 FRAMES, SECONDS = 60, 2.0
+BEFORE = 1.0  # s, over which actuator states and delayed controls run on to the start
 
 
 def poses(model, recordings, count=4):
@@ -19,16 +20,28 @@ def whole(model, qpos):
 
 def simulate(model, recording, first, last, columns):
     """(last - first + 1, nq) from the recorded state of row `first` under the recorded control. columns: (qpos, dof)
-    indices of the recorded coordinates within `model`. NaN from where the simulation blows up."""
+    indices of the recorded coordinates within `model`. NaN from where the simulation blows up.
+
+    Actuator states and delayed controls come from the control before `first`, the mechanism held where it was recorded;
+    before the recording's first row it is that row's."""
     data = mujoco.MjData(model)
-    data.qpos[columns[0]] = np.where(np.isnan(recording.qpos[first]), data.qpos[columns[0]], recording.qpos[first])
-    data.qvel[columns[1]] = velocity(model, recording, first, columns)
+    ahead = BEFORE if model.na or (model.actuator_delay > 0).any() else 0.0
+    start = recording.time[first] - ahead  # where data.time is 0
+    at = lambda: max(0, int(np.searchsorted(recording.time, start + data.time + 1e-9, side="right")) - 1)
+
+    def put(row):
+        data.qpos[columns[0]] = np.where(np.isnan(recording.qpos[row]), data.qpos[columns[0]], recording.qpos[row])
+        data.qvel[columns[1]] = velocity(model, recording, row, columns)
+
+    while data.time < ahead - 0.5 * model.opt.timestep:
+        put(at())
+        data.ctrl[:recording.ctrl.shape[1]] = recording.ctrl[at()]
+        mujoco.mj_step(model, data)
+    put(first)
     out = np.full((last - first + 1, recording.qpos.shape[1]), np.nan)
-    start = recording.time[first]
     for row in range(first, last + 1):
         while data.time < recording.time[row] - start - 0.5 * model.opt.timestep:
-            now = max(first, int(np.searchsorted(recording.time, start + data.time + 1e-9, side="right")) - 1)
-            data.ctrl[:recording.ctrl.shape[1]] = recording.ctrl[now]
+            data.ctrl[:recording.ctrl.shape[1]] = recording.ctrl[max(first, at())]
             mujoco.mj_step(model, data)
             if any(data.warning[k].number for k in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL,
                                                     mujoco.mjtWarning.mjWARN_BADQACC)):

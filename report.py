@@ -55,7 +55,7 @@ def write(diagnosis, out):
         summary["findings"][curve["finding"]]["saved_as"] = name
     files = {"report.html": html_page(diagnosis),
              "diagnosis.json": json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n",
-             "corrected.xml": diagnosis.corrected_xml, **{name: _csv(curve) for name, curve in saved.items()}}
+             "corrected.xml": portable(diagnosis.corrected_xml, out), **{name: _csv(curve) for name, curve in saved.items()}}
     made = not os.path.isdir(out)
     try:
         os.makedirs(out, exist_ok=True)
@@ -67,6 +67,22 @@ def write(diagnosis, out):
             os.rmdir(out)
         raise ReportError(f"the report is not written: {error}") from None
     return list(files)
+
+
+def portable(xml, out):
+    """MJCF for folder `out`: where it reads files, folders of meshes and textures as seen from there, else without them."""
+    reads = re.search(r'\sfile="', xml)
+
+    def seen(match):
+        attribute, folder = match[1], html.unescape(match[2])
+        if not reads:
+            return ""
+        try:
+            folder = os.path.relpath(os.path.realpath(folder), os.path.realpath(out)).replace(os.sep, "/")
+        except ValueError:  # on another drive
+            pass
+        return f' {attribute}="{E(folder)}"'
+    return re.sub(r'(?<=<compiler)[^>]*', lambda head: re.sub(r'\s(meshdir|texturedir)="([^"]*)"', seen, head[0]), xml)
 
 
 def _earlier(out):
@@ -361,12 +377,13 @@ def _about(diagnosis):
     notes = "".join(f"<li>{E(note)}</li>" for note in summary.get("warnings", []))
     noise = ", ".join(f"{wording.channel_words(name)} {wording.number(value, 2)}" for name, value in summary["noise"].items())
     train, held = (_names(part) for part in (diagnosis.train, diagnosis.held_out))
+    files = "; it reads meshes and textures from where the nominal model has them" if 'file="' in diagnosis.corrected_xml else ""
     more = ", and unknown_<n>.csv (a force without a name, as a curve)" if unknown_curves(diagnosis) else ""
     return _section("The recordings",
                     f"<p>Fitted: {E(train)}.<br>Held out: {E(held)}.<br>Noise of the sensors (SI): {E(noise)}.</p>",
                     f"<ul>{notes}</ul>" if notes else "",
                     '<p class="note">Beside this page: diagnosis.json (all numbers) and corrected.xml (the corrected model, for '
-                    "stock MuJoCo).</p>")
+                    f"stock MuJoCo{files}){E(more)}.</p>")
 
 
 def _names(recordings, most=12):

@@ -301,6 +301,42 @@ def test_motion_starts_as_recorded_and_follows_stock_mujoco():
         mujoco.mj_step(model, data, nstep=5)
 
 
+@pytest.mark.parametrize("memory", ["dyntype='filter' dynprm='.2'", "dyntype='none' delay='.1' nsample='60'"])
+def test_motion_runs_on_from_the_control_before_it(memory):
+    """One that starts in the middle of a run of the model itself follows that run."""
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep=".002"/><worldbody><body><joint name="j" type="slide" axis="1 0 0" damping="1"/>
+        <geom size=".1" mass="1"/></body></worldbody><actuator><general joint="j" gainprm="20" {memory}/></actuator></mujoco>""")
+    data, rows = mujoco.MjData(model), 200
+    ctrl = np.repeat(np.random.default_rng(0).uniform(-1, 1, rows // 20), 20)[:, None]
+    ctrl[:20] = 0.0
+    qpos, qvel = np.empty((2, rows, 1))
+    for row in range(rows):
+        qpos[row], qvel[row], data.ctrl[:] = data.qpos, data.qvel, ctrl[row]
+        mujoco.mj_step(model, data, nstep=5)
+    recording = Recording("r", 0.01 * np.arange(rows), qpos, qvel, ctrl)
+    columns = motion.columns_in(model, model)
+    for first in (0, 95):
+        np.testing.assert_allclose(motion.simulate(model, recording, first, 199, columns), qpos[first:], atol=0.01)
+    assert abs(qpos).max() > 0.1
+
+
+@pytest.mark.parametrize("used", [True, False])
+def test_corrected_file_finds_meshes_from_the_report_wherever_both_go(tmp_path, used):
+    parts, out = tmp_path / "here/model/parts & more", tmp_path / "here/report"
+    parts.mkdir(parents=True)
+    out.mkdir()
+    (parts / "tetra.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    mesh, geom = ('<asset><mesh name="t" file="tetra.obj"/></asset>', 'type="mesh" mesh="t"') if used else ("", 'size=".1"')
+    (parts.parent / "sim.xml").write_text(f"""<mujoco><compiler meshdir="parts &amp; more"/>{mesh}<worldbody><body><joint/><geom {geom}/></body>
+        </worldbody></mujoco>""")
+    world = World.load(parts.parent / "sim.xml")
+    text = report.portable(world.corrected_xml({world.candidate("coulomb_friction", "0"): (0.5,)})[0], out)
+    (out / "corrected.xml").write_text(text)
+    assert str(tmp_path) not in text and ("meshdir" in text) == used
+    (tmp_path / "here").rename(tmp_path / "there")
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "there/report/corrected.xml")).dof_frictionloss[0] == 0.5
+
+
 def test_overlay_finds_recorded_joints_in_a_model_with_more(diagnosis):
     spec = mujoco.MjSpec.from_string(diagnosis.corrected_xml)
     spec.body("upper").add_joint(name="backlash", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0])
