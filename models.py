@@ -2,7 +2,7 @@
 
     policy = GaussianPolicy(nobs=11, nact=3)
     action = policy.act(obs)                           # (N, 3), sampled; .mean(obs) is deterministic
-    policy.save("policy.pt"); policy = GaussianPolicy.load("policy.pt")
+    torch.save(policy.checkpoint(), "policy.pt"); policy = GaussianPolicy.load("policy.pt")
     f = ForwardModel(11, 3); f.fit(s, a, s_next, guess, generator); s_hat = f(s, a, guess)      # f_psi
 
 All are float32 MLPs that normalise their own inputs, and need torch alone.
@@ -137,16 +137,14 @@ class GaussianPolicy(nn.Module):
         mean = self.net.values(self.normalizer(obs))[-1]
         return mean + self.log_std.exp() * torch.randn(mean.shape, generator=generator)
 
-    def save(self, path):
-        torch.save({"sizes": list(self.sizes), "state": self.state_dict()}, path)
+    def checkpoint(self):
+        """What load() needs to build this policy again."""
+        return {"sizes": list(self.sizes), "state": self.state_dict()}
 
     @classmethod
     def load(cls, path):
-        """The policy that save() wrote. Raises ValueError for any other file; never unpickles code."""
-        return cls.from_state(load_checkpoint(path))
-
-    @classmethod
-    def from_state(cls, saved):
+        """The policy whose checkpoint() is in a file. Raises ValueError for any other file; never unpickles code."""
+        saved = load_checkpoint(path)
         try:
             sizes = saved["sizes"]
             policy = cls(sizes[0], sizes[-1], tuple(sizes[1:-1]))

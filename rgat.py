@@ -166,6 +166,7 @@ class GroundingSettings:
     at: TRPOConfig = AT_CONFIG  # rgat: TRPO for the action transformer
     at_std: float = 0.01  # rgat: its initial standard deviation, in units of the action range
     residual: bool = True  # rgat and gat: f_psi corrects the sim's own prediction
+    per_step: bool = True  # rgat and oracle: R_AT in units of each dimension's change in a real step, not as it stands
     smoothing: float = 0.95  # gat: a_hat = smoothing * g(s, a) + (1 - smoothing) * a
     ane_width: float = 0.2  # ane: standard deviation of the action noise, in units of half the action range
 
@@ -190,7 +191,7 @@ class Grounding:
     def _measure_scale(self, tau_real):
         """The unit of each dimension of R_AT, from the first real data: later, a robot that stands still would
         make it vanishingly small."""
-        if (self.scale == 1).all():
+        if self.settings.per_step and (self.scale == 1).all():
             self.scale = step_size(tau_real)
 
     def update(self, policy, steps, seed, on_update=None):

@@ -1,10 +1,15 @@
-"""A run on disk: settings, tables, checkpoints, figure and animation; everything is written whole or not at all."""
+"""A run on disk: settings, tables, checkpoints, figure and animation; everything is written whole or not at all.
+
+And what is seen of it meanwhile: the progress bar.
+"""
 
 import csv
+import hashlib
 import io
 import json
 import os
 import platform
+import time
 import zipfile
 from pathlib import Path
 
@@ -14,6 +19,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
+from tqdm import tqdm
 
 from files import write_table, write_whole
 from models import GaussianPolicy, load_checkpoint
@@ -42,7 +48,9 @@ def save_whole(path, tensors):
 def versions():
     """What the numbers of a run depend on besides its settings."""
     packages = {package.__name__: package.__version__ for package in (mujoco, gymnasium, torch, np)}
-    return {"python": platform.python_version(), **packages, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+    sources = b"".join((Path(__file__).parent / f"{name}.py").read_bytes() for name in ("envs", "models", "trpo"))
+    machine = f"{platform.machine()}, {os.cpu_count()} cores"
+    return {"python": platform.python_version(), **packages, "machine": machine, "learner": hashlib.sha256(sources).hexdigest()[:16]}
 
 
 class Run:
@@ -178,6 +186,49 @@ class Run:
         image = io.BytesIO()
         figure.savefig(image, format="png", dpi=110)
         write_whole(self.folder / "progress.png", image.getvalue())
+
+
+class Bar:
+    """Progress on a terminal, train.csv and the figure along the way, and the steps and seconds of each grounding step."""
+
+    def __init__(self, s, run):
+        self.run, self.seen, self.drawn, self.clock = run, 0, time.monotonic(), time.monotonic()
+        self.world = "real" if s.algo == "real" else "sim"
+        at_steps = s.at_steps * (s.algo == "rgat")
+        total = s.pretrain_steps + s.reference_steps * (s.algo != "real") + s.grounding_steps * (s.policy_steps + at_steps)
+        self.tqdm = tqdm(total=total, unit="step", unit_scale=True, disable=None, dynamic_ncols=True, smoothing=0.05)
+
+    def phase(self, step, name):
+        """An on_update callback for one phase of one grounding step."""
+        before = 0
+
+        def on_update(stats):
+            nonlocal before
+            new, before = stats["steps"] - before, stats["steps"]
+            self.seen += new * (name != "reference")
+            self.tqdm.update(new)
+            self.tqdm.set_description(f"step {step}, {name}, return {stats['return']:.0f}")
+            self.run.log_update(step, name, stats)
+            if time.monotonic() - self.drawn > 20:
+                self.run.flush()
+                self.drawn = time.monotonic()
+
+        return on_update
+
+    def skip(self, steps, counts=True):
+        """Steps that an earlier run has done; counts: they are this run's own, not a reference line's."""
+        self.seen += steps * counts
+        for count in ("initial", "n", "last_print_n") if not self.tqdm.disable else ():  # they tell nothing about the speed
+            setattr(self.tqdm, count, getattr(self.tqdm, count) + steps)
+
+    def lap(self):
+        """(environment steps, seconds) since the last lap."""
+        steps, seconds = self.seen, time.monotonic() - self.clock
+        self.seen, self.clock = 0, time.monotonic()
+        return steps, seconds
+
+    def say(self, line):
+        self.tqdm.write(line)
 
 
 # --- replay: the planar robots drawn from their geoms, with no need of OpenGL ------------------------

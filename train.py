@@ -11,20 +11,19 @@ import hashlib
 import json
 import dataclasses
 import sys
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import torch
-from tqdm import tqdm
 
-from envs import BatchEnv, EnvError, parse_perturbation, task_of
+from envs import BatchEnv, EnvError, model_path, parse_perturbation, perturb, task_of
 from files import WriteError, write_whole
 from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint
 from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, identity, one_step_error
 from remodel import Physics
-from runs import Run, RunError, animate, save_whole, versions
+from runs import Bar, Run, RunError, animate, save_whole, versions
 from trpo import PRESETS, TRPO, Transitions, rollouts
 from world import quiet
 
@@ -99,7 +98,7 @@ class Settings:
             raise RunError(f"--at-gamma is {done.at_gamma}: it must be at least 0 and below 1")
         if not 0 <= done.ane_width < np.inf or not 0 <= done.at_entropy < np.inf:
             raise RunError("--ane-width and --at-entropy must be 0 or more")
-        BatchEnv(done.env, 1, parse_perturbation(done.real), nthread=1)  # names that are not in the model end here
+        perturb(mujoco.MjModel.from_xml_path(str(model_path(done.env))), parse_perturbation(done.real))  # are the names the model's?
         return done
 
 
@@ -132,8 +131,7 @@ def algorithm_1(s, run, bar):
         tau_new = collect(s, grounding, policy, real, seeds("collect"))  # 2: collect tau_real
         tau_real += tau_new
         stats = grounding.fit(tau_real, policy, seeds("model"))  # 3: train f_psi with tau_real
-        stats |= grounding.update(policy, s.at_steps, seeds("transformer"), bar.phase(step, "transformer"))  # 4: update g_phi
-        stats |= errors(s, sim, grounding, real, policy, seeds("held out"))
+        stats |= transform(s, grounding, policy, sim, real, seeds, bar.phase(step, "transformer"))  # 4: update g_phi
         grounded_sim = GroundedEnv(grounding.sim, grounding.transformer)
         learner.learn(grounded_sim, s.policy_steps, seeds("policy"), on_update=bar.phase(step, "policy"))  # 5: update pi_theta
         record(s, run, step, learner, grounding, real, tau_new, stats, bar)  # 6: end while; the run keeps the best policy
@@ -155,12 +153,14 @@ def nothing(env):
     return Transitions(s, a, s)
 
 
-def errors(s, sim, grounding, real, policy, seed):
-    """One-step errors with the transformer and without, on real transitions that nothing was fitted on."""
-    held_out = rollouts(policy, real, s.eval_episodes, seed)[1]
+def transform(s, grounding, policy, sim, real, seeds, log):
+    """A new action transformer, and its statistics: among them the one-step errors with it and without, on real
+    transitions that nothing was fitted on."""
+    stats = grounding.update(policy, s.at_steps, seeds("transformer"), log)
+    held_out = rollouts(policy, real, s.eval_episodes, seeds("held out"))[1]
     error, change = one_step_error(grounding.sim, grounding.transformer, held_out)
     untouched = one_step_error(sim, identity, held_out)[0]
-    return {"at_one_step_error": error, "identity_one_step_error": untouched, "delta_action_rms": change}
+    return {**stats, "at_one_step_error": error, "identity_one_step_error": untouched, "delta_action_rms": change}
 
 
 def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
@@ -181,9 +181,8 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
         **stats,
         "seconds": round(float(before["seconds"]) + seconds, 1),
     }
-    acting = {"sizes": list(learner.policy.sizes), "state": learner.policy.state_dict()}
     transformer = grounding.state() if step else {}
-    run.record(row, {"learner": learner.state(), "grounding": transformer, "acting": acting}, tau_new)
+    run.record(row, {"learner": learner.state(), "grounding": transformer, "acting": learner.policy.checkpoint()}, tau_new)
     bar.say(f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real")
 
 
@@ -276,49 +275,6 @@ def pretrained(s, world, env, steps, bar):
 
 
 # --- the command line ---------------------------------------------------------------------------------
-
-
-class Bar:
-    """Progress on a terminal, train.csv and the figure along the way, and the steps and seconds of each grounding step."""
-
-    def __init__(self, s, run):
-        self.run, self.seen, self.drawn, self.clock = run, 0, time.monotonic(), time.monotonic()
-        self.world = "real" if s.algo == "real" else "sim"
-        at_steps = s.at_steps * (s.algo == "rgat")
-        total = s.pretrain_steps + s.reference_steps * (s.algo != "real") + s.grounding_steps * (s.policy_steps + at_steps)
-        self.tqdm = tqdm(total=total, unit="step", unit_scale=True, disable=None, dynamic_ncols=True, smoothing=0.05)
-
-    def phase(self, step, name):
-        """An on_update callback for one phase of one grounding step."""
-        before = 0
-
-        def on_update(stats):
-            nonlocal before
-            new, before = stats["steps"] - before, stats["steps"]
-            self.seen += new * (name != "reference")
-            self.tqdm.update(new)
-            self.tqdm.set_description(f"step {step}, {name}, return {stats['return']:.0f}")
-            self.run.log_update(step, name, stats)
-            if time.monotonic() - self.drawn > 20:
-                self.run.flush()
-                self.drawn = time.monotonic()
-
-        return on_update
-
-    def skip(self, steps, counts=True):
-        """Steps that an earlier run has done; counts: they are this run's own, not a reference line's."""
-        self.seen += steps * counts
-        for count in ("initial", "n", "last_print_n") if not self.tqdm.disable else ():  # they tell nothing about the speed
-            setattr(self.tqdm, count, getattr(self.tqdm, count) + steps)
-
-    def lap(self):
-        """(environment steps, seconds) since the last lap."""
-        steps, seconds = self.seen, time.monotonic() - self.clock
-        self.seen, self.clock = 0, time.monotonic()
-        return steps, seconds
-
-    def say(self, line):
-        self.tqdm.write(line)
 
 
 def verdict(s, run):

@@ -78,13 +78,11 @@ def main():
 def ground(s, v, sim, real, policy, tau_real, seed):
     """The grounding of one variant, the world that it acts in, and the statistics of its fit."""
     method, world = METHODS[v["method"]], real if v["method"] == "real" else sim
-    settings = GroundingSettings()
+    settings = GroundingSettings(per_step=v["norm"] != "raw")
     if v["method"] == "rgat":
         at = dataclasses.replace(AT_CONFIG, max_kl=v["at_max_kl"], gamma=v["at_gamma"])
-        settings = GroundingSettings(at=at, at_std=v["at_std"], residual=v["forward_model"] == "residual")
+        settings = dataclasses.replace(settings, at=at, at_std=v["at_std"], residual=v["forward_model"] == "residual")
     grounding = method(world, settings, real.model) if v["method"] == "oracle" else method(world, settings)
-    if v["norm"] == "raw":
-        grounding._measure_scale = lambda tau: None  # dimensions stay as they are
     fit = grounding.fit(tau_real, policy, seed)
     grounding.update(policy, s.at_steps, seed)
     return grounding, world, fit

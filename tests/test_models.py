@@ -218,7 +218,7 @@ def test_policy_survives_saving(tmp_path):
     torch.manual_seed(0)
     policy = GaussianPolicy(5, 2, (8, 6), log_std=-1)
     policy.normalizer.update(torch.randn(100, 5) * 4 + 1)
-    policy.save(tmp_path / "policy.pt")
+    torch.save(policy.checkpoint(), tmp_path / "policy.pt")
     loaded = GaussianPolicy.load(tmp_path / "policy.pt")
     obs = torch.randn(9, 5)
     torch.testing.assert_close(loaded.mean(obs), policy.mean(obs), rtol=0, atol=0)
@@ -227,7 +227,7 @@ def test_policy_survives_saving(tmp_path):
 
 
 def test_policy_loads_with_torch_alone(tmp_path):
-    GaussianPolicy(5, 2).save(tmp_path / "policy.pt")
+    torch.save(GaussianPolicy(5, 2).checkpoint(), tmp_path / "policy.pt")
     program = (
         "import sys\n"
         "for name in ('mujoco', 'gymnasium', 'matplotlib', 'tqdm', 'PIL'): sys.modules[name] = None\n"
@@ -253,7 +253,7 @@ class Trap:
 def bad_files(folder):
     policy = GaussianPolicy(5, 2)
     good = folder / "good.pt"
-    policy.save(good)
+    torch.save(policy.checkpoint(), good)
     data = good.read_bytes()
     (folder / "empty.pt").write_bytes(b"")
     (folder / "text.pt").write_text("return,seed\n1,2\n")

@@ -195,6 +195,17 @@ def test_gat_smooths_the_inverse_models_action():
     np.testing.assert_allclose(other.transformer(obs, a), expected, atol=1e-6)
 
 
+def test_the_units_of_the_reward_are_of_a_real_step_unless_told():
+    sim, tau = world("InvertedPendulum-v4"), real_data("InvertedPendulum-v4", 30)
+    scales = []
+    for per_step in (True, False):
+        grounding = RGAT(sim, replace(SMALL, per_step=per_step))
+        grounding.fit(tau, policy_for(sim), 0)
+        scales.append(grounding.scale)
+    np.testing.assert_allclose(scales[0], np.sqrt(np.mean((tau.s_next - tau.s) ** 2, axis=0)), rtol=1e-3)
+    np.testing.assert_array_equal(scales[1], np.ones(4))
+
+
 def test_rgat_learns_repeats_and_reloads():
     tau, results = real_data("InvertedPendulum-v4", 30), []
     for _ in range(2):
