@@ -13,6 +13,7 @@ import earning
 import evidence
 import scores
 import selection
+import sensors
 import shooting
 import windows as cut
 
@@ -100,6 +101,8 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
                "held_out": figure(world, settings, held, position_noise, velocity_noise)}
     figures["held_out"]["horizon_s"] = cut.HORIZON
     figures["held_out"]["curve"] = evidence.curve(world, settings, held, position_noise, velocity_noise)
+    if others := sensors.errors(world, settings, held):
+        figures["held_out"]["sensors"] = others
     before, after, floor = (figures["held_out"][k] for k in ("before", "after", "floor"))
     findings = []
     xml, written = world.corrected_xml(settings)
@@ -118,6 +121,7 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
             **({"curve": form} if curve else {})})
     if event:
         findings.append(event_finding(event, train))
+    findings += sensors.faults(world, settings, train, position_noise, velocity_noise)
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     summary = {"format": 1, "verdict": "mismatch" if findings else "match",
                "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,

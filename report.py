@@ -234,6 +234,7 @@ def _facts(finding):
         if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
             facts.append(f"removes {100 * value:.0f} % of the held-out error" if key == "held_out_error_removed" else
                          f"removes {100 * value:.0f} % of the error around it" if key == "error_removed_there" else
+                         f"removes {100 * value:.0f} % of the sensor's own error" if key == "sensor_error_removed" else
                          f"p {wording.p_value(value)}" if key == "p_value" else
                          f"{key.replace('_', ' ')} {wording.number(value)}")
     return facts + [{"mjcf": "held in corrected.xml", "none": "has no plain MJCF form, so not in corrected.xml",
@@ -313,6 +314,9 @@ def _prediction(diagnosis):
         values = (None if channel[key] is None else channel[key] * factor for key in ("before", "after", "floor"))
         rows.append([E(wording.channel_words(name)), *(wording.number(value, 2) for value in values), E(unit)])
     table = _table(["", "nominal", "corrected", "perfect", ""], rows)
+    rows = [[E(name), *(wording.number(sensor[key], 2) for key in ("before", "after", "noise")), E(sensor["unit"])]
+            for name, sensor in (fit.get("sensors") or {}).items()]
+    table += _table(["sensor", "nominal", "corrected", "its noise", ""], rows)
     return _section("How well it predicts recordings it was not fitted to", _pair(picture, table),
                     note="A perfect simulator, too, would start from measured positions and velocities: their noise sets the "
                          "limit.")

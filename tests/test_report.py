@@ -56,9 +56,11 @@ def diagnosis():
                 finding("gravity", "world", "world", -9.81, np.float64(-9.7), 0.02, "m/s²", written_as="none")]
     channels = {f"qpos:{name}": {"before": 0.03, "after": 0.002, "floor": 0.001, "unit": "rad"} for name in ("shoulder", "elbow")}
     curve = [{"seconds": s, "before": 30 * s + 1, "after": 2 * s + 1, "floor": 1.0} for s in np.linspace(0.05, 1, 12)]
+    curve[-1]["blown_up"] = {"before": 3, "after": 0, "of": 40}
     summary = {"format": 1, "verdict": "mismatch", "noise": {"qpos:shoulder": 0.001, "qpos:elbow": np.float32(0.001)}, "findings": findings,
                "fit": {"train": {"before": 31.0, "after": 2.0, "floor": 1.0},
-                       "held_out": {"before": 30.0, "after": 2.0, "floor": 1.0, "horizon_s": 0.3, "curve": curve, "channels": channels}},
+                       "held_out": {"before": 30.0, "after": 2.0, "floor": 1.0, "horizon_s": 0.3, "curve": curve, "channels": channels,
+                                    "sensors": {"gyro <1>": {"before": 0.3, "after": 0.02, "noise": 0.01, "unit": "rad/s"}}}},
                "unexplained": {"fraction": 0.05, "place": {"kind": "joint", "name": "elbow"}, "depends_on": ["position:elbow"]},
                "warnings": ["run5.csv: ctrl:elbow_motor <stays> at its extreme"]}
     traces = [{"recording": r.name, "channel": f"qpos:{name}", "time": r.time, "measured": r.qpos[:, k], "nominal": r.qpos[:, k] + 0.1,
@@ -461,7 +463,8 @@ def test_page_is_well_formed_and_self_contained(kind, request):
 def test_page_says_it_all(diagnosis):
     page = report.html_page(diagnosis)
     for words in ("joint elbow: Coulomb friction 0.120 ± 0.004 N·m was left out", "dead zone", "push the joint by hand with the actuator off",
-                  "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "force (N·m)", "a force that the catalogue has no name for", "force left at elbow (N·m)", "badmark"):
+                  "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "force (N·m)", "a force that the catalogue has no name for", "force left at elbow (N·m)", "badmark", "gyro &lt;1&gt;",
+                  "3 of 40 windows blow up under the nominal model: from then on they are left out of its line."):
         assert words in page, words
 
 
