@@ -286,7 +286,9 @@ class BatchEnv(VectorEnv):
         done = terminated | truncated
         if done.any():
             ids = np.flatnonzero(done)
-            info["final_obs"] = np.array([next_obs[i] if d else None for i, d in enumerate(done)] + [None], object)[:-1]
+            info["final_obs"] = np.full(self.num_envs, None)
+            for i in ids:
+                info["final_obs"][i] = next_obs[i]
             info["_final_obs"] = done
             self._restart(ids)
             self.obs = self.observe()

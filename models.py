@@ -131,11 +131,25 @@ class GaussianPolicy(nn.Module):
         """Mean (N, nact) and log_std (nact,)."""
         return self.mean(obs), self.log_std
 
-    @torch.no_grad()
     def act(self, obs, generator=None):
         """A sample for each row of obs: (N, nact)."""
-        mean = self.net.values(self.normalizer(obs))[-1]
-        return mean + self.log_std.exp() * torch.randn(mean.shape, generator=generator)
+        return self.sampler(generator)(obs)
+
+    @torch.no_grad()
+    def sampler(self, generator=None):
+        """act() of the policy as it now is: in a rollout, what depends on its weights alone is worked out once."""
+        center, std, clip, sigma = self.normalizer.mean, self.normalizer.std, self.normalizer.clip, self.log_std.exp()
+        *hidden, (bias, weight) = [(layer.bias, layer.weight.t()) for layer in self.net.linear]
+
+        @torch.no_grad()
+        def act(obs):
+            x = torch.clamp((obs - center) / std, -clip, clip)
+            for b, w in hidden:
+                x = torch.addmm(b, x, w).tanh_()
+            mean = torch.addmm(bias, x, weight)
+            return mean + sigma * torch.randn(mean.shape, generator=generator)
+
+        return act
 
     def checkpoint(self):
         """What load() needs to build this policy again."""
