@@ -118,6 +118,14 @@ class Effect:
                 for k, p in enumerate(parameters) for d in (p.step, -p.step) if p.low <= p.nominal + d <= p.high]
         return np.array(rows)
 
+    def far(self, model, i, recordings):
+        """Values (P, parameters) to try besides a small step: so far off an effect no longer acts in proportion."""
+        return ()
+
+    def suited(self, parameters, model, i, recordings):
+        """The parameters with steps and bounds that suit the recorded motion."""
+        return parameters
+
     def canonical(self, values):
         """The same effect in its usual numbers, where several sets of values mean the same."""
         return values

@@ -66,7 +66,7 @@ def identify(world, train, held_out, progress=None):
     final = selection.Search(world, problem, train)
     if hypothesis.effects:
         [fit] = shooting.solve(final.problem, [hypothesis], fit)
-        fit = final.drop(fit, ())
+        fit = final.drop(shooting.renewed(final.problem, fit), ())
         fit = earned(final, fit, windows_for(world, train, cut.HORIZON, FINAL_STEPS, event), position_noise)
         hypothesis = fit.hypothesis
     if left and left.candidate not in hypothesis.candidates:
@@ -86,7 +86,7 @@ def searched(data, say):
     Where the first leaves much unfound, windows were too long for that: motion far off is soon not linear.
     """
     world, train = data[:2]
-    hypothesis, ranking, span = misfit.Hypothesis(), [], 0.0
+    hypothesis, ranking, span, kept = misfit.Hypothesis(), [], 0.0, None
     for i in range(ROUNDS):
         say(0.05 + 0.15 * i, "choosing windows")
         longer = span_for(*data, hypothesis, at_least=span)
@@ -97,20 +97,37 @@ def searched(data, say):
         span = longer
         # in few rows even a small part of what an unstable mechanism first missed is much
         share = UNFOUND if sum(len(r.time) for r in train) > FEW_ROWS else 0.0
-        shorter = span
-        while not i and fit.chi2.sum() > max(MUCH * search.problem.rows, share * before) and shorter > LEAST_ROWS * cut.sampling(train):
-            shorter /= 3
-            say(0.15, f"searching {len(world.candidates)} candidates in {shorter:.2g} s windows")
-            other, less, _ = sought(world, train, problem_of(*data, shorter, SEARCH_STEPS), hypothesis)
-            [again] = shooting.solve(other.problem, [fit.hypothesis], less)
-            better = not fit.hypothesis.effects or less.chi2.sum() < (1 - selection.WORTH) * again.chi2.sum()
-            if less.hypothesis.effects and better:
-                search, fit, span = other, less, shorter
-            if fit.hypothesis.effects:
-                break
+        much = fit.chi2.sum() > max(MUCH * search.problem.rows, share * before)
+        if much and kept:  # too long again
+            search, fit, span = kept
+            break
+        if much and not i:
+            found = shorter(data, search, fit, span, say)
+            kept = found if found[2] < span else None
+            search, fit, span = found
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     return search, fit, ranking, span
+
+
+def shorter(data, search, fit, span, say):
+    """(Search, Fit, span) of shorter windows in which something is found, or as given.
+
+    What longer windows said, wrong as its value may be for start states that stuck there, is a beginning in these.
+    """
+    world, train = data[:2]
+    less_span = span
+    while less_span > LEAST_ROWS * cut.sampling(train):
+        less_span /= 3
+        say(0.15, f"searching {len(world.candidates)} candidates in {less_span:.2g} s windows")
+        other, less, _ = sought(world, train, problem_of(*data, less_span, SEARCH_STEPS), misfit.Hypothesis())
+        if fit.hypothesis.effects:
+            [again] = shooting.solve(other.problem, [fit.hypothesis], less)
+            if again.chi2.sum() < (1 + selection.WORTH) * less.chi2.sum():
+                less = other.run(other.drop(again, ()))
+        if less.hypothesis.effects:
+            return other, less, less_span
+    return search, fit, span
 
 
 def sought(world, train, problem, hypothesis):

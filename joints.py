@@ -1,5 +1,7 @@
 """Effects in a joint: a hinge or slide, some in a ball joint too. Their scales follow the joint's own inertia."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 
@@ -9,6 +11,7 @@ from effects import (BALL, HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Effect, Param
 # frictionloss as a nearly rigid constraint: with MuJoCo's default a stuck joint creeps
 SOLREF_FRICTION = (0.004, 1.0)
 SOLIMP_FRICTION = (0.999, 0.9999, 0.001, 0.5, 2.0)
+STRENGTHS = 1.0, 10.0, 100.0  # of a force that grows faster than in proportion, over what turns the fastest motion round
 DISSIPATION = ('viscous_damping', 'coulomb_friction', 'quadratic_damping', 'back_emf')
 
 
@@ -41,6 +44,13 @@ class JointEffect(Effect):
         known = [np.isfinite(r.qpos[:, q]) for r in recordings]  # between measured rows, be they next to each other or not
         speed = [np.diff(r.qpos[k, q]) / np.diff(r.time[k]) for r, k in zip(recordings, known)]
         return np.concatenate([r.qpos[k, q] for r, k in zip(recordings, known)]), abs(np.concatenate(speed))
+
+
+    def reach(self, model, i, recordings):
+        """How far from its spring's rest, and how fast, the joint was recorded, but for the odd row."""
+        position, speed = self.travel(model, i, recordings)
+        far = abs(position - model.qpos_spring[model.jnt_qposadr[i]])
+        return [float(max(np.quantile(x, 0.99, method='lower'), 1e-3)) if len(x) else 1.0 for x in (far, speed)]
 
 
 class JointNumber(JointEffect):
@@ -99,6 +109,13 @@ class QuadraticDamping(JointNumber):
     name, related = 'quadratic_damping', DISSIPATION
     number, compiled, authored = ('damping2', 'N·m·s²/rad²', 'N·s²/m²'), ('dof_dampingpoly', 0), ('damping', 1)
 
+    def suited(self, parameters, model, i, recordings):
+        _, fastest = self.reach(model, i, recordings)
+        return replace(parameters[0], step=max(parameters[0].step / fastest, 0.01 * abs(parameters[0].nominal))),
+
+    def far(self, model, i, recordings):
+        return [(strength * self.scale(model, i) / self.reach(model, i, recordings)[0],) for strength in STRENGTHS]
+
 
 @catalogue
 class CoulombFriction(JointNumber):
@@ -133,6 +150,14 @@ class NonlinearStiffness(JointNumber):
     name, simplicity, related = 'nonlinear_stiffness', 2, ('stiffness', 'spring_offset')
     number, compiled, authored = ('stiffness3', 'N·m/rad³', 'N/m³'), ('jnt_stiffnesspoly', 1), ('stiffness', 2)
     step, signed = 0.1, True
+
+    def suited(self, parameters, model, i, recordings):
+        farthest, _ = self.reach(model, i, recordings)
+        return replace(parameters[0], step=max(parameters[0].step / farthest**2, 0.01 * abs(parameters[0].nominal))),
+
+    def far(self, model, i, recordings):
+        farthest, fastest = self.reach(model, i, recordings)
+        return [(strength * self.scale(model, i) * fastest**2 / farthest**4,) for strength in STRENGTHS]
 
 
 @catalogue
@@ -223,6 +248,12 @@ class Cogging(JointEffect):
                 Parameter('poles', self.unit(model, i, '1', 'rad/m'), 6.0, 0.1, 1e6, 0.1),
                 Parameter('phase', 'rad', 0.0, -10.0, 10.0, 0.1))
 
+    def suited(self, parameters, model, i, recordings):
+        """At least one whole wave within the recorded travel: less is only a bent spring."""
+        amplitude, poles, phase = parameters
+        travel = np.ptp(self.travel(model, i, recordings)[0])
+        return amplitude, replace(poles, low=max(poles.low, 2 * np.pi / max(travel, 1e-9))), phase
+
     def probes(self, model, i, recordings):
         """Ripples close enough to each other for one of them to stay in step over the whole travel."""
         position, _ = self.travel(model, i, recordings)
@@ -230,8 +261,10 @@ class Cogging(JointEffect):
         if turns(model, i) and travel > 5:
             poles = np.arange(1, 25)
         else:
-            poles = np.arange(2.0, 23.0, 1.5) / travel
-        return np.array([(0.05 * self.scale(model, i), n, phase) for n in poles for phase in (0.0, np.pi / 2)])
+            poles = np.arange(2.0, 80.0, 2.0) / travel
+        farthest, fastest = self.reach(model, i, recordings)
+        amplitude = max(0.05, 0.1 * fastest**2 / farthest) * self.scale(model, i)  # too little does not show beside dry friction
+        return np.array([(amplitude, n, phase) for n in poles for phase in (0.0, np.pi / 2)])
 
     def canonical(self, values):
         amplitude, poles, phase = values

@@ -57,6 +57,9 @@ class Mass(InertialEffect):
         m = model.body_mass[i]
         return Parameter('mass', 'kg', m, 0.02 * m, 50 * m, 0.01 * m),
 
+    def far(self, model, i, recordings):
+        return [(factor * model.body_mass[i],) for factor in (4.0, 20.0)]
+
     def edit(self, model, i, values):
         model.body_inertia[i] *= values[0] / model.body_mass[i]
         model.body_mass[i] = values[0]

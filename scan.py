@@ -8,7 +8,7 @@ Columns are differences of simulations, with start states and the fit's own para
 what is significant is measured between clusters of windows (scores).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,25 +66,14 @@ def options_of(world, recordings):
             continue
         if candidate.effect.overrides("probes") and unseen(world, candidate.place, recordings):
             continue
-        if candidate.effect.name == "cogging":
-            candidate = rippling(world, candidate, recordings)
+        candidate = world.suited(candidate, recordings)
         if candidate.effect.overrides("probes"):
             out += [Option(candidate, (tuple(float(v) for v in row),), False) for row in world.probes(candidate, recordings)]
         else:
             moved = shooting.perturbed(misfit.Hypothesis(((candidate, candidate.nominal),)))[0]
             out.append(Option(candidate, tuple(m[candidate] for m in moved), True))
-            # far from its nominal a mass does not act in proportion; friction that sticks has no gradient at all
-            factors = {"mass": (4.0, 20.0), "contact_friction": (0.5, 0.2)}.get(candidate.effect.name, ())
-            out += [Option(candidate, ((factor * candidate.nominal[0],),), False) for factor in factors]
+            out += [Option(candidate, (values,), False) for values in world.far(candidate, recordings)]
     return out
-
-
-def rippling(world, candidate, recordings):
-    """Cogging with at least one whole wave within the recorded travel: less is only a bent spring."""
-    address = world.model.joint(candidate.place.name).qposadr[0]
-    travel = max(np.nanmax(r.qpos[:, address]) - np.nanmin(r.qpos[:, address]) for r in recordings)
-    least = 2 * np.pi / max(travel, 1e-9)
-    return replace(candidate, parameters=tuple(replace(p, low=max(p.low, least)) if p.name == "poles" else p for p in candidate.parameters))
 
 
 class Scan:
@@ -175,13 +164,13 @@ class Scan:
                 del self.looked[t.option]
         return self.scan(fit, options, self.problem)
 
-    def screened(self, fit, options, most=12):
+    def screened(self, fit, options, most=16):
         """The most promising of the many probes of effects without gradient, looked at in few windows."""
         found, _, _, chi2 = self.scan(fit.subset(self.scouts), options, self.scouting)
         out, count = [], {}
         for t in found:
             candidate = t.option.candidate
-            if t.gain > WORTH / 3 * chi2 and count.setdefault(candidate, 0) < 2 and len(out) < most:
+            if t.gain > WORTH / 3 * chi2 and count.setdefault(candidate, 0) < 4 and len(out) < most:
                 count[candidate] += 1
                 out.append(t.option)
         self.kept.update(out)

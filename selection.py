@@ -40,7 +40,9 @@ class Search(Scan):
                 break
             late = chosen is None
             refused = refused | {frozenset(c for c, _ in p) for p in proposals} if late else set()
-            fit = fit if late else self.drop(*chosen)
+            if not late:
+                fit, added = chosen
+                fit = self.drop(shooting.renewed(self.problem, fit), added)
         return fit
 
     def proposals(self, fit, trials, gram, score, chi2, looks=12, singles=5, doubles=2):

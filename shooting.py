@@ -17,6 +17,7 @@ from observer import far_apart, observed
 
 UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a parameter counts as without effect
 GOOD = 0.5  # share of the fall of the squared residual that a Jacobian promised, from which on it is kept
+STUCK = 0.02  # share of the squared residual that start states found anew have to spare
 KEPT = 8  # fits of start states that are remembered
 
 
@@ -53,6 +54,19 @@ def fit_starts(problem, hypothesis, iterations=12, sharp=True):
         kept[key] = fit
         if len(kept) > KEPT:
             del kept[next(iter(kept))]
+    return fit
+
+
+def renewed(problem, fit, most=3):
+    """The fit with start states found anew where that leaves less, for they may have stuck on the way; solved again then."""
+    for _ in range(most):
+        fresh = fit_starts(problem, fit.hypothesis)
+        better = fresh.chi2 < fit.chi2
+        if np.minimum(fresh.chi2, fit.chi2).sum() > (1 - STUCK) * fit.chi2.sum():
+            break
+        parts = ((getattr(fresh, x), getattr(fit, x)) for x in ("qpos", "qvel", "residual", "start_jacobian"))
+        merged = Fit(fit.hypothesis, *(np.where(better.reshape(-1, *[1] * (x.ndim - 1)), x, y) for x, y in parts))
+        [fit] = solve(problem, [fit.hypothesis], merged, iterations=4)
     return fit
 
 

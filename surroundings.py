@@ -5,6 +5,8 @@ import numpy as np
 
 from effects import Effect, Parameter, catalogue
 
+FACTORS = 0.25, 0.5, 2.0, 4.0  # of a contact's stiffness or damping, whose effect soon is not in proportion
+
 
 @catalogue
 class Gravity(Effect):
@@ -155,6 +157,9 @@ class ContactFriction(ContactEffect):
         mu = self.pair(model, i)[1][0]
         return Parameter('sliding', '1', mu, 1e-4, 10.0, 0.02 * mu),
 
+    def far(self, model, i, recordings):
+        return [(factor * self.pair(model, i)[1][0],) for factor in (0.5, 0.2)]  # what sticks has no gradient
+
     @staticmethod
     def change(friction, solref, values):
         friction[0] = values[0]
@@ -169,6 +174,9 @@ class ContactStiffness(ContactEffect):
         k = _direct(self.pair(model, i)[2])[0]
         return Parameter('stiffness', '1/s²', k, 1e-3 * k, 1e3 * k, 0.02 * k),
 
+    def far(self, model, i, recordings):
+        return [(factor * _direct(self.pair(model, i)[2])[0],) for factor in FACTORS]
+
     @staticmethod
     def change(friction, solref, values):
         solref[:] = -values[0], -_direct(solref)[1]
@@ -182,6 +190,9 @@ class ContactDamping(ContactEffect):
     def parameters(self, model, i):
         b = _direct(self.pair(model, i)[2])[1]
         return Parameter('damping', '1/s', b, 1e-3 * b, 1e3 * b, 0.02 * b),
+
+    def far(self, model, i, recordings):
+        return [(factor * _direct(self.pair(model, i)[2])[1],) for factor in FACTORS]
 
     @staticmethod
     def change(friction, solref, values):
@@ -199,6 +210,10 @@ class GroundHeight(Effect):
     def parameters(self, model, i):
         z = model.geom_pos[i, 2]
         return Parameter('z', 'm', z, z - 10.0, z + 10.0, 0.0005),
+
+    def far(self, model, i, recordings):
+        small = model.geom_rbound[touchable(model, i) & (model.geom_rbound > 0)].min(initial=1.0)
+        return [(model.geom_pos[i, 2] + share * small,) for share in (-0.1, -0.03, 0.03, 0.1)]
 
     def edit(self, model, i, values):
         model.geom_pos[i, 2] = values[0]

@@ -106,6 +106,15 @@ class World:
         """Values (P, parameters) worth a first try, for effects whose nominal value has no gradient too."""
         return candidate.effect.probes(self.model, candidate.effect.id(self.model, candidate.place.name), recordings)
 
+    def far(self, candidate, recordings):
+        """Values (P, parameters) to try besides a small step."""
+        return candidate.effect.far(self.model, candidate.effect.id(self.model, candidate.place.name), recordings)
+
+    def suited(self, candidate, recordings):
+        """The candidate with steps and bounds that suit the recorded motion."""
+        i = candidate.effect.id(self.model, candidate.place.name)
+        return replace(candidate, parameters=candidate.effect.suited(candidate.parameters, self.model, i, recordings))
+
     def related(self, candidate):
         """Candidates at the same joints in whose wrong nominal values this one may hide."""
         mine, out = self._joints(candidate.place), []
