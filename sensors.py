@@ -3,7 +3,8 @@
     errors(world, settings, held_out)                                          # {sensor: before, after, noise, unit}
     faults(world, settings, train, position_noise, velocity_noise)             # findings: a bias, scale or delay of one
 
-Nothing is fitted to them but their own faults, and those only where one explains nearly all that the corrected model leaves.
+Nothing is fitted to them but their own faults, and those only where one explains nearly all that the corrected model leaves,
+of sensors of motion: forces are the model's own, and where they differ it may be the model that is wrong.
 """
 
 import mujoco
@@ -19,6 +20,7 @@ LEVEL = 1e-3  # false-alarm rate, shared between all sensors and faults
 EXPLAINED = 0.8  # of what lies above a sensor's noise, the share that its fault must explain
 LATE = 0.1  # s, of a window, before which a late sensor would read what was before it
 SAME = 0.05  # errors closer than this cannot be told apart
+MOTION = "rad", "rad/s", "rad/s²", "m", "m/s", "m/s²"
 UNITS = {"rad": "JOINTPOS BALLQUAT FRAMEQUAT", "rad/s": "JOINTVEL GYRO BALLANGVEL FRAMEANGVEL", "rad/s²": "FRAMEANGACC",
          "m": "TENDONPOS FRAMEPOS RANGEFINDER SUBTREECOM GEOMDIST", "m/s": "TENDONVEL VELOCIMETER FRAMELINVEL SUBTREELINVEL",
          "m/s²": "ACCELEROMETER FRAMELINACC", "N": "TOUCH FORCE", "N·m": "TORQUE", "T": "MAGNETOMETER", "J": "E_POTENTIAL E_KINETIC"}
@@ -72,7 +74,7 @@ def errors(world, settings, recordings):
 
 def faults(world, settings, train, position_noise, velocity_noise, most=100):
     """[finding] for every sensor of which a bias, a scale or a delay explains nearly all that the corrected model leaves."""
-    known, out = recorded(world.model, train), []
+    known, out = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION], []
     if not known:
         return out
     windows = evidence.consecutive(train, cut.HORIZON)

@@ -76,6 +76,7 @@ def test_a_sound_sensor_and_a_wrong_model_are_no_faults():
     assert faults(None, damping=0.2) == []
     assert sensors.faults(world(), {}, [replace(run(0), sensors={})], None, None) == []
     assert sensors.errors(world(), {}, [replace(run(0), sensors={})]) == {}
+    assert faults(lambda name, x: 1.2 * x if name == "force" else x) == []  # the gain may be wrong, too
 
 
 @pytest.mark.parametrize("effect, name, value, fault", [
