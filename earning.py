@@ -29,7 +29,7 @@ def earned(search, fit, windows, position_noise):
         before, after = (squares(search.world, s, windows, noise) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
         if not overall(after) > (1 + WORSE) * overall(before):
             far = fit.chi2.sum() > FAR * search.freedom
-            without = absent(search, fit, windows, noise, 1 if far else 0) if len(candidates) > 1 else [before]
+            without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
             gains = [scatter(windows, after, less) for less in without]
             weak = [i for i, (gain, bound, whole) in enumerate(gains) if not gain > (max(bound, SLIGHT * whole) if far else -bound)]
             if not weak:
@@ -53,16 +53,16 @@ def scatter(windows, one, other):
     return rise.sum(), scores.t_quantile(len(rise) - 1, LEVEL) * np.sqrt(len(rise)) * rise.std(ddof=1), errors[0].sum()
 
 
-def absent(search, fit, windows, noise, polish):
-    """[squares] of windows without each effect of a fit, the others refitted."""
-    fits = refitted(search, fit, [fit.hypothesis.minus(c) for c in fit.hypothesis.candidates], polish)
+def absent(search, fit, windows, noise, far):
+    """[squares] of windows without each effect of a fit, the others refitted: with care only where the model is far from the
+    noise, for else nothing but harm is looked for."""
+    shorter = [fit.hypothesis.minus(c) for c in fit.hypothesis.candidates]
+    if far:
+        fits = shooting.solve(search.small, shorter, fit.subset(search.few), iterations=3)
+        fits = shooting.solve(search.problem, [f.hypothesis for f in fits], fit, iterations=1)
+    else:
+        fits = shooting.solve(search.scouting, shorter, fit.subset(search.scouts), iterations=2)
     return [squares(search.world, [f.hypothesis.settings] * len(windows), windows, noise) for f in fits]
-
-
-def refitted(search, fit, hypotheses, polish=1):
-    """Hypotheses near that of a fit, refitted: on few windows, which serve for most of the way, then by a step on all."""
-    near = shooting.solve(search.small, hypotheses, fit.subset(search.few), iterations=3)
-    return shooting.solve(search.problem, [f.hypothesis for f in near], fit, iterations=polish) if polish else near
 
 
 def elsewhere(search, fit, windows):

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-import earning
 import evidence
 import scores
 import selection
@@ -228,7 +227,7 @@ def also_possible(search, fit, train, noise, candidate, others, most=3):
     best = rms(fit.hypothesis) if stood else 0.0
     near = [h for h in stood if rms(h) < (1 + NEAR) * best][:most + 1]
     out = []
-    for f in earning.refitted(search, fit, near):
+    for f in shooting.solve(search.problem, near, fit, iterations=1):  # few windows have brought them near
         other, values = f.hypothesis.effects[-1]
         if len(out) < most and rms(f.hypothesis) < (1 + SAME) * best:
             out.append({"effect": other.effect.name, "place": place_of(other), "parameters": parameters_of(other, values)})
