@@ -317,10 +317,12 @@ def names(diagnosis):
 
 
 def test_nothing_missing_is_a_match():
-    diagnosis = diagnosed()
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded(f"run{k}.csv", k, seconds=4.0 if k < 2 else 40.0) for k in range(3)]  # an error in noise is itself chance
+    diagnosis = identify(world, runs[:2], runs[2:])
     assert diagnosis.summary["verdict"] == "match" and not diagnosis.summary["findings"]
     fit = diagnosis.summary["fit"]["held_out"]
-    assert fit["before"] == fit["after"] == pytest.approx(fit["floor"], rel=0.2)
+    assert fit["before"] == fit["after"] == pytest.approx(fit["floor"], rel=0.15)
     assert diagnosis.summary["noise"]["qpos:pivot"] == pytest.approx(NOISE, rel=0.15)
 
 
