@@ -10,7 +10,6 @@ in the reported error too, by more than that scatters between recordings or stre
 import numpy as np
 
 import evidence
-import misfit
 import scores
 import shooting
 import windows as cut
