@@ -16,7 +16,7 @@ import selection
 import shooting
 import unknown
 import windows as cut
-from identify import identify
+from identify import identify, named_instead
 from recordings import Recording
 from world import World
 
@@ -231,6 +231,21 @@ def test_alternatives_are_refitted_and_listed_where_they_predict_as_well():
     only, = findings.also_possible(selection.Search(world, problem, runs), fit, runs, noise, offset, others)
     assert (only["effect"], only["place"]["name"]) == ("bias", "drive")
     assert only["parameters"][0]["value"] == pytest.approx(0.03, rel=0.02)  # the motor has no gear: the same torque
+
+
+def test_what_stands_in_a_curves_place_brings_its_equals_along():
+    runs = [recorded(f"run{k}.csv", k, damping=0.1) for k in range(2)]
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.2)], np.array([NOISE]), np.array([np.inf]))
+    curve = world.curve("pivot", "velocity:pivot", (-5.0, 0.0, 5.0))
+    [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(curve, (0.2, 0.0, -0.2))], shooting.fit_starts(problem, misfit.Hypothesis()))
+    hypothesis, possible = named_instead(selection.Search(world, problem, runs), fit, curve)
+    [(name, values)] = hypothesis.effects
+    [(_, others)] = possible.items()
+    straight = {("viscous_damping", "pivot"), ("back_emf", "drive")}  # this curve is a line
+    assert (name.effect.name, name.place.name) in straight and list(possible) == [name]
+    assert straight <= {(c.effect.name, c.place.name) for _, c, _ in others} | {(name.effect.name, name.place.name)}
+    assert values[0] - name.nominal[0] == pytest.approx(0.05, rel=0.05)
 
 
 def test_scatter_of_errors_between_recordings_is_students():

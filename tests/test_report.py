@@ -468,6 +468,13 @@ def test_page_says_it_all(diagnosis):
         assert words in page, words
 
 
+def test_where_and_when_in_words():
+    assert wording.when_words({"qpos:elbow": [0.4, 0.8]}) == ", where the position of elbow is between 0.400 and 0.800"
+    assert wording.when_words({"qvel:elbow": [0, 2]}) == ", where the velocity of elbow is between 0 and 2.00"
+    assert wording.when_words({"recording": "run3.csv", "time": [2.0, 7.5]}) == ", in run3.csv from 2.00 to 7.50 s"
+    assert wording.when_words(None) == ""
+
+
 def test_a_stop_on_one_side_and_a_model_that_blows_up(diagnosis, tmp_path):
     """JSON keeps numbers where the contract has them; page and terminal say it in words."""
     stop = finding("joint_stop", "joint", "elbow", 0.0, 0.0, 0.0, "rad", parameters=[
