@@ -20,6 +20,7 @@ import clock
 import events
 import findings
 import misfit
+import observer
 import selection
 import shooting
 import unknown
@@ -29,12 +30,13 @@ from recordings import RecordingError
 
 SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
 FINAL_STEPS = 30000
-LEAST_ROWS, LEAST_WINDOWS, FEW_ROWS = 8, 20, 100
+LEAST_ROWS, LEAST_APART, LEAST_WINDOWS, FEW_ROWS = 8, 3, 20, 100
 LEFTOVER_SPANS = 0.2, 0.1  # s
 MOST = 0.7  # share of the squared residual, that a leftover explains, above which no shorter windows are asked
 STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up to which the curve does without them
 GROSS = 5.0  # residual of a window over the usual one, that it may count for
 MUCH, UNFOUND = 4.0, 0.05  # squared residual, over the noise's and the nominal model's, above which shorter windows are tried
+LONGER = 1.3  # times what the shortest windows leave, up to which rows far apart are followed
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
@@ -186,10 +188,15 @@ def windows_for(world, recordings, span, steps, event=None):
     for r in recordings:
         sample = np.median(np.diff(r.time))
         for first, end in events.quiet(r, event):
-            every += cut.consecutive(r, max(span, LEAST_ROWS * sample), first, end)
+            every += cut.consecutive(r, max(span, least(recordings) * sample), first, end)
     duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
     number = max(LEAST_WINDOWS, int(steps / dear(world.model) * world.model.opt.timestep / duration))
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]
+
+
+def least(recordings):
+    """Rows of the shortest windows: where rows are far apart much happens between two."""
+    return LEAST_APART if observer.far_apart(recordings) else LEAST_ROWS
 
 
 def dear(model):
@@ -202,11 +209,16 @@ def problem_of(world, recordings, position_noise, velocity_noise, event, span, s
     return misfit.Problem(world, windows_for(world, recordings, span, steps, event), position_noise, velocity_noise)
 
 
+def missed(problem, fit):
+    """Median residual of windows, in noises."""
+    rows = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
+    return np.sqrt(np.median(fit.chi2 / rows))
+
+
 def follows(problem, fit, share_allowed):
     """Whether a model follows its windows: the median residual is a few noises, or a small part of the motion."""
     weight, size = problem.weight, problem.weight[0].size
-    rows = np.maximum((weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
-    if np.sqrt(np.median(fit.chi2 / rows)) < FOLLOWS:
+    if missed(problem, fit) < FOLLOWS:
         return True
     gap = fit.residual[:, :size].reshape(weight.shape) / np.where(weight > 0, weight, np.inf)
     moved = np.nanstd(cut.difference(problem.model, problem.measured_qpos[:, :1], problem.measured_qpos), axis=1)
@@ -218,20 +230,26 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
     """The longest window span that the model with a hypothesis follows, from a few samples up.
 
     Up to LONGEST (or a few dozen rows) while the residual is a few noises; where recordings are far more precise than
-    any model, longer windows only add nonlinearity, and half the reported horizon is enough.
+    any model, longer windows only add nonlinearity, and half the reported horizon is enough. Where rows are far apart
+    start states soon end in local minima, and longer windows are to leave no more than the shortest.
     """
     sample = cut.sampling(train)
     duration = np.median([np.ptp(r.time) for r in train])
-    shortest = max(LEAST_ROWS * sample, at_least)
+    shortest = max(least(train) * sample, at_least)
     if sum(len(r.time) for r in train) < FEW_ROWS:  # too little to be cut
         return float(duration)
     enough = sum(np.ptp(r.time) for r in train) / 12  # clusters need windows
     longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration, enough))
 
-    def followed(span):
+    def fitted(span):
         problem = problem_of(world, train, position_noise, velocity_noise, event, span, SEARCH_STEPS / 4)
-        return follows(problem, shooting.fit_starts(problem, hypothesis, sharp=False), FOLLOWS_SHARE if span < 0.6 * cut.HORIZON else 0.0)
+        return problem, shooting.fit_starts(problem, hypothesis, sharp=False)
 
+    def followed(span):
+        problem, fit = fitted(span)
+        return follows(problem, fit, FOLLOWS_SHARE if span < 0.6 * cut.HORIZON else 0.0) and missed(problem, fit) < most
+
+    most = LONGER * missed(*fitted(shortest)) if observer.far_apart(train) else np.inf
     span = float(np.clip(cut.HORIZON / 2, shortest, longest))
     if followed(span):
         while span < longest and followed(min(2 * span, longest)):

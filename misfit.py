@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import windows as cut
+from observer import far_apart
 
 BLOWN_UP = 1e3  # residual, in noises, of a prediction that is not finite
 BLOCK_BYTES = 16e6  # of residuals worked out at a time
@@ -99,6 +100,7 @@ class Problem:
         small = np.where(finite > 0, finite, 1e-4)
         self.start_step = np.concatenate([0.5 * small, 0.5 * small / span])
         self.rows = int(self.weight.astype(bool).sum())
+        self.far_apart = far_apart(w.recording for w in self.windows)
         self.size = self.weight[0].size + 2 * nv
         self.key = tuple((id(r), *rows) for r, *rows in self.windows), position_noise.tobytes(), np.asarray(velocity_noise).tobytes()
 
@@ -109,6 +111,15 @@ class Problem:
         for name in ("measured_qpos", "measured_qvel", "weight", "guess_qpos", "guess_qvel"):
             setattr(out, name, getattr(self, name)[keep])
         out.rows = int(out.weight.astype(bool).sum())
+        return out
+
+    def first_rows(self, number):
+        """The problem with no more than the first rows of every window."""
+        out = self.subset(np.arange(len(self.windows)))
+        out.windows = [w._replace(last=min(w.last, w.first + number - 1)) for w in self.windows]
+        for name in ("measured_qpos", "measured_qvel", "weight"):
+            setattr(out, name, getattr(self, name)[:, :number])
+        out.size = out.weight[0].size + 2 * self.model.nv
         return out
 
     def weighted(self, fit, factor):
@@ -123,6 +134,12 @@ class Problem:
         every = np.arange(len(self.windows))
         residual = self.residuals([fit.hypothesis.settings] * len(every), every, fit.qpos, fit.qvel, refine=2)
         return Fit(fit.hypothesis, fit.qpos, fit.qvel, residual, fit.start_jacobian)
+
+    def coarse(self, fit, finer):
+        """The same fit with its residual as it is without the candidate `finer`."""
+        every, hypothesis = np.arange(len(self.windows)), fit.hypothesis.minus(finer)
+        residual = self.residuals([hypothesis.settings] * len(every), every, fit.qpos, fit.qvel)
+        return Fit(hypothesis, fit.qpos, fit.qvel, residual, fit.start_jacobian)
 
     def residuals(self, settings, which, qpos, qvel, refine=1):
         """(S, m): S simulations, the i-th in window which[i] under settings[i] from (qpos[i], qvel[i])."""

@@ -1,7 +1,7 @@
 """Start states from the rows before: the simulator runs along the recording and is put right at every row.
 
-    if far_apart(windows):
-        qpos, qvel = observed(world, windows, settings)
+    if far_apart(recordings):
+        qpos, qvel = observed(world, windows, [settings] * len(windows))
 
 Where rows lie far apart joints turn round and feet meet the ground between them, and no difference of positions tells
 the speed. A simulator that is nearly right does: what it misses in the position of one row, over the time since the last,
@@ -16,13 +16,13 @@ CORRECTIONS, GAIN = 8, 0.6  # rows that put a state right; share of the missed s
 APART = 0.02  # s between rows, from which on they are far apart
 
 
-def far_apart(windows):
-    """Whether speeds by differences are no good start in windows: their rows are APART."""
-    return cut.sampling(w.recording for w in windows) > APART * (1 - 1e-6)
+def far_apart(recordings):
+    """Whether speeds by differences are no good start: the rows of recordings are APART."""
+    return cut.sampling(recordings) > APART * (1 - 1e-6)
 
 
 def observed(world, windows, settings):
-    """States at the first rows of windows under settings: qpos (W, nq), qvel (W, nv). As recorded, at a recording's start."""
+    """States at the first rows of windows, each under its settings: qpos (W, nq), qvel (W, nv). As recorded, at a recording's start."""
     model = world.model
     first = np.array([w.first for w in windows])
     at = np.maximum(first - CORRECTIONS, 0)
@@ -30,7 +30,7 @@ def observed(world, windows, settings):
     while (at < first).any():
         live = np.flatnonzero(at < first)
         steps = [windows[i]._replace(first=at[i], last=at[i] + 1) for i in live]
-        predicted, speed = (x[:, 1] for x in world.simulate([settings] * len(live), qpos[live], qvel[live], steps))
+        predicted, speed = (x[:, 1] for x in world.simulate([settings[i] for i in live], qpos[live], qvel[live], steps))
         at[live] += 1
         measured, known = (np.array([getattr(windows[i].recording, x)[at[i]] for i in live]) for x in ("qpos", "qvel"))
         missed = np.nan_to_num(cut.difference(model, predicted, measured))

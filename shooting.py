@@ -13,11 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from misfit import Fit
-from observer import far_apart, observed
+from observer import observed
 
 UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a parameter counts as without effect
 GOOD = 0.5  # share of the fall of the squared residual that a Jacobian promised, from which on it is kept
 STUCK = 0.02  # share of the squared residual that start states found anew have to spare
+POOR = 4.0  # standard deviations of noise's square by which a window leaves more than the best quarter, that make it poor
+FIRST, LED, LEADS = 3, 4, 2  # rows that a start is led from; iterations each time; steps of the parameters at which it is done
 KEPT = 8  # fits of start states that are remembered
 
 
@@ -44,12 +46,14 @@ def fit_starts(problem, hypothesis, iterations=12, sharp=True):
         begun = jacobian(fit.qpos, fit.qvel, fit.residual)
     else:
         starts = [(problem.guess_qpos, problem.guess_qvel)]
-        if far_apart(problem.windows):
-            starts.append(observed(problem.world, problem.windows, hypothesis.settings))
+        if problem.far_apart:
+            starts.append(observed(problem.world, problem.windows, settings))
         tried = [(*start, problem.residuals(settings, every, *start)) for start in starts]
         best = np.argmin([(residual**2).sum(1) for *_, residual in tried], axis=0)
         begun = jacobian(*(np.stack(parts)[best, every] for parts in zip(*tried)))
     [fit] = _fit_starts(problem, [begun], 2 if sharp else iterations, fresh=True)
+    if not sharp:
+        [fit] = led(problem, [fit])
     if problem.key:
         kept[key] = fit
         if len(kept) > KEPT:
@@ -78,12 +82,19 @@ def follow(problem, begun, iterations):
 def _fit_starts(problem, begun, iterations, fresh):
     """The start states of several Fits at once. A window's Jacobian follows its steps by Broyden's update; it is computed
     anew only where a step brings little of what it promised, unless it was fresh (of this very state and hypothesis)."""
-    number, every = len(problem.windows), np.arange(len(begun) * len(problem.windows))
-    which = every % number
+    number = len(problem.windows)
+    which = np.tile(np.arange(number), len(begun))
     settings = [s for f in begun for s in [f.hypothesis.settings] * number]
+    states = (np.concatenate([getattr(f, x) for f in begun]) for x in ("qpos", "qvel", "residual", "start_jacobian"))
+    parts = (np.split(x, len(begun)) for x in _descended(problem, settings, which, *states, iterations, fresh))
+    return [Fit(f.hypothesis, *x) for f, *x in zip(begun, *parts)]
+
+
+def _descended(problem, settings, which, qpos, qvel, residual, jacobian, iterations, fresh):
+    """Start states of simulations, the i-th in window which[i] under settings[i], fitted: (qpos, qvel, residual, jacobian)."""
     pick = lambda rows: ([settings[i] for i in rows], which[rows])
-    qpos, qvel, residual, jacobian = (np.concatenate([getattr(f, x) for f in begun]) for x in ("qpos", "qvel", "residual", "start_jacobian"))
-    damping, fresh, active = np.full(len(every), 1e-3), np.full(len(every), fresh), every
+    active = np.arange(len(which))
+    damping, fresh = np.full(len(which), 1e-3), np.full(len(which), fresh)
     for i in range(iterations):
         slope = jacobian[active]
         step = np.einsum("wij,wmj,wm->wi", _eliminate(slope, damping[active]), slope, residual[active])
@@ -109,8 +120,40 @@ def _fit_starts(problem, begun, iterations, fresh):
         active = active[gained | stale | (~better & (damping[active] < 1e3))]
         if not len(active):
             break
-    parts = (np.split(x, len(begun)) for x in (qpos, qvel, residual, jacobian))
-    return [Fit(f.hypothesis, *x) for f, *x in zip(begun, *parts)]
+    return qpos, qvel, residual, jacobian
+
+
+def led(problem, fits):
+    """Fits with the start states of their poor windows sought again where rows are far apart: from the observer on, for the
+    first rows alone, then for more and more.
+
+    Between such rows feet meet the ground; a state that leads through some rows nearly leads through the next, and any
+    other start ends in a local minimum. Windows are poor beside the best quarter of their fit.
+    """
+    if not problem.far_apart or not fits:
+        return fits
+    free = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
+    each = np.array([f.chi2 / free for f in fits])
+    owner, which = np.nonzero(each > (1 + POOR * np.sqrt(2 / free)) * np.quantile(each, 0.25, axis=1, keepdims=True))
+    if not len(which):
+        return fits
+    settings = [fits[h].hypothesis.settings for h in owner]
+    qpos, qvel = observed(problem.world, [problem.windows[w] for w in which], settings)
+    rows, longest = FIRST, problem.weight.shape[1]
+    while True:
+        part = problem.first_rows(rows) if rows < longest else problem
+        residual = part.residuals(settings, which, qpos, qvel)
+        jacobian = part.start_jacobians(settings, which, qpos, qvel, residual)
+        qpos, qvel, residual, jacobian = _descended(part, settings, which, qpos, qvel, residual, jacobian, LED, True)
+        if part is problem:
+            break
+        rows += max(1, rows // 2)
+    better = (residual**2).sum(1) < np.array([fits[h].chi2[w] for h, w in zip(owner, which)])
+    out = [Fit(f.hypothesis, f.qpos.copy(), f.qvel.copy(), f.residual.copy(), f.start_jacobian.copy()) for f in fits]
+    for i in np.flatnonzero(better):
+        f, w = out[owner[i]], which[i]
+        f.qpos[w], f.qvel[w], f.residual[w], f.start_jacobian[w] = qpos[i], qvel[i], residual[i], jacobian[i]
+    return out
 
 
 # ---- hypotheses with parameters ----------------------------------------------------------------
@@ -166,6 +209,7 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
     far = [h for h in range(len(hypotheses)) if current[h].chi2.sum() > 1.01 * warm[h].chi2.sum()]
     for h, fit in zip(far, follow(problem, [current[h] for h in far], iterations=3)):
         current[h] = fit
+    current = led(problem, current)
     damping = np.full(len(hypotheses), 1e-3)
     moving = [h for h in range(len(hypotheses))]
     for iteration in range(iterations):
@@ -175,7 +219,7 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
         slopes = columns(problem, [current[h] for h in moving], [p for p, _ in perturbations])
         proposals = []
         for h, (_, moves), slope in zip(moving, perturbations, slopes):
-            proposals.append(_propose(current[h], slope, moves, damping[h]))
+            proposals.append(_propose(current[h], slope, moves, damping[h], problem.far_apart))
         # new parameters, once with moved and once with kept start states: a window takes the better
         trial = []
         for h, (vector, step) in zip(moving, proposals):
@@ -184,16 +228,17 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
         residual = problem.residuals([s for t in trial for s in [t[0].settings] * number], np.tile(every, len(trial)),
                                      np.concatenate([t[1] for t in trial]), np.concatenate([t[2] for t in trial]))
         residual = residual.reshape(len(trial), number, -1)
-        still, polish = [], []
+        still, polish, tried = [], [], []
         for i, h in enumerate(moving):
             a, b = 2 * i, 2 * i + 1
-            cost = (residual[[a, b]] ** 2).sum(-1)  # (2, W)
-            pick = np.argmin(cost, 0)
-            old, new = current[h].chi2.sum(), cost.min(0).sum()
+            pick = np.argmin((residual[[a, b]] ** 2).sum(-1), 0)[:, None]
+            take = lambda x, y: np.where(pick == 0, x, y)
+            tried.append(Fit(trial[a][0], take(trial[a][1], trial[b][1]), take(trial[a][2], trial[b][2]),
+                             take(residual[a], residual[b]), current[h].start_jacobian))
+        for h, fit in zip(moving, led(problem, tried) if iteration < LEADS else tried):
+            old, new = cost(problem, current[h]), cost(problem, fit)
             if new < old:
-                take = lambda x, y: np.where(pick[:, None] == 0, x, y)
-                current[h] = Fit(trial[a][0], take(trial[a][1], trial[b][1]), take(trial[a][2], trial[b][2]),
-                                 np.where(pick[:, None] == 0, residual[a], residual[b]), current[h].start_jacobian)
+                current[h] = fit
                 damping[h] = max(damping[h] / 10, 1e-6)
                 polish.append(h)
             else:
@@ -211,6 +256,11 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
                 current[h].start_jacobian = j
         moving = still
     return current
+
+
+def cost(problem, fit):
+    """What solve lowers: the squared residual; where rows are far apart the residuals' sizes, lest windows stuck far off decide."""
+    return (np.sqrt(fit.chi2) if problem.far_apart else fit.chi2).sum()
 
 
 def _polish(problem, current, which):
@@ -255,7 +305,7 @@ def evaluate(problem, hypotheses, warm):
     return [Fit(h, q, v, r, f.start_jacobian) for h, f, q, v, r in zip(hypotheses, warm, *parts)]
 
 
-def _propose(fit, slope, moves, damping):
+def _propose(fit, slope, moves, damping, robust):
     """Gauss-Newton step of parameters and start states together, start states eliminated: vector (k,), step (W, 2 nv).
 
     slope (W, m, k): change of the prediction as each parameter moves by moves (k,).
@@ -264,8 +314,14 @@ def _propose(fit, slope, moves, damping):
     inverse = _eliminate(jacobian, np.full(len(jacobian), damping))
     cross = np.einsum("wmi,wmk->wik", jacobian, slope)
     pull = np.einsum("wmi,wm->wi", jacobian, residual)
-    normal = np.einsum("wmk,wml->kl", slope, slope) - np.einsum("wik,wij,wjl->kl", cross, inverse, cross)
-    push = np.einsum("wmk,wm->k", slope, residual) - np.einsum("wik,wij,wj->k", cross, inverse, pull)
+    normal = np.einsum("wmk,wml->wkl", slope, slope) - np.einsum("wik,wij,wjl->wkl", cross, inverse, cross)
+    push = np.einsum("wmk,wm->wk", slope, residual) - np.einsum("wik,wij,wj->wk", cross, inverse, pull)
+    if robust:
+        each = np.concatenate([np.einsum("wkk->wk", normal), (residual**2).sum(1)[:, None]], 1)
+        usual = np.median(each, 0)
+        weight = np.where(each > usual, usual / np.maximum(each, 1e-300), 1.0)[:, usual > UNSEEN].min(1)
+        normal, push = normal * weight[:, None, None], push * weight[:, None]
+    normal, push = normal.sum(0), push.sum(0)
     vector = fit.hypothesis.vector
     low = np.array([p.low for p in fit.hypothesis.parameters])
     high = np.array([p.high for p in fit.hypothesis.parameters])
