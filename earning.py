@@ -4,7 +4,7 @@
 
 The search judges by windows whose start states are fitted, where a small effect shows best. Where that model reaches the
 noise it is to be trusted; where it does not, an effect may only bend towards another that is missing, and has to show
-in the reported error too, by more than that scatters between recordings or stretches of them.
+in the reported error too: by more than that scatters between recordings or stretches of them, or clearly in all.
 """
 
 import numpy as np
@@ -30,7 +30,8 @@ def earned(search, fit, windows, position_noise):
             far = fit.chi2.sum() > FAR * search.freedom
             without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
             gains = [scatter(windows, after, less) for less in without]
-            weak = [i for i, (gain, bound, whole) in enumerate(gains) if not gain > (max(bound, SLIGHT * whole) if far else -bound)]
+            weak = [i for i, (gain, bound, whole) in enumerate(gains) if not gain > (max(bound, SLIGHT * whole) if far else -bound)
+                    and not (far and overall(without[i]) > (1 + WORSE) * overall(after))]
             if not weak:
                 break
             gone = candidates[min(weak, key=lambda i: gains[i][0] / max(gains[i][1], 1e-300))]
