@@ -3,8 +3,10 @@
 import mujoco
 import numpy as np
 import pytest
+import shooting
 from diagnose import _world
 from envs import model_path
+from misfit import Hypothesis, Problem
 from observer import observed
 from recordings import Recording
 from windows import consecutive, recorded_starts
@@ -63,3 +65,28 @@ def test_holes_and_measured_velocities():
     assert np.abs(observed(world, windows, [{}] * len(windows))[1] - qvel[first]).max() < 0.1 * np.abs(qvel).max()
     recording.qvel[:] = qvel
     np.testing.assert_allclose(observed(world, windows, [{}] * len(windows))[1], qvel[first])
+
+
+def test_led_starts_and_bounded_steps_find_a_mass_through_contacts():
+    """A runner seen every 50 ms: windows end in local minima by the usual way, and hold a parameter where it begins."""
+    world = _world(model_path("HalfCheetah-v4"))
+    torso = next(c for c in world.candidates if c.effect.name == "mass" and c.place.name == "torso")
+    real = _world(model_path("HalfCheetah-v4")).model
+    real.body_mass[1] *= 1.15
+    real.body_inertia[1] *= 1.15
+    mujoco.mj_setConst(real, mujoco.MjData(real))
+    recording, _ = recorded(real, np.random.default_rng(3).uniform(-1, 1, (150, 6)), 5, noise=1e-3)
+    noise, unmeasured = np.full(9, 1e-3), np.full(9, np.inf)
+    problem = Problem(world, consecutive(recording, 0.25), noise, unmeasured)
+    freedom = 6 * 9 - 18  # of a window
+    truth = Hypothesis().plus(torso, (1.15 * torso.nominal[0],))
+    good = lambda fit: np.mean(fit.chi2 < 2 * freedom)
+    led = good(shooting.fit_starts(problem, truth))
+    world.fits.clear()
+    problem.far_apart = False
+    assert led > max(0.8, 0.1 + good(shooting.fit_starts(problem, truth)))
+    world.fits.clear()
+    problem.far_apart = True
+    begun = Hypothesis().plus(torso, (1.02 * torso.nominal[0],))
+    [fit] = shooting.solve(problem, [begun], shooting.fit_starts(problem, Hypothesis()))
+    assert abs(fit.hypothesis.vector[0] / torso.nominal[0] - 1.15) < 0.02
