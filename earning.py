@@ -31,7 +31,7 @@ def earned(search, fit, windows, position_noise):
             without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
             gains = [scatter(windows, after, less) for less in without]
             weak = [i for i, (gain, bound, whole) in enumerate(gains) if not gain > (max(bound, SLIGHT * whole) if far else -bound)
-                    and not (far and overall(without[i]) > (1 + WORSE) * overall(after))]
+                    and not (far and overall(without[i]) > (1 + SLIGHT) * overall(after))]
             if not weak:
                 break
             gone = candidates[min(weak, key=lambda i: gains[i][0] / max(gains[i][1], 1e-300))]
