@@ -135,12 +135,6 @@ class Problem:
         residual = self.residuals([fit.hypothesis.settings] * len(every), every, fit.qpos, fit.qvel, refine=2)
         return Fit(fit.hypothesis, fit.qpos, fit.qvel, residual, fit.start_jacobian)
 
-    def coarse(self, fit, finer):
-        """The same fit with its residual as it is without the candidate `finer`."""
-        every, hypothesis = np.arange(len(self.windows)), fit.hypothesis.minus(finer)
-        residual = self.residuals([hypothesis.settings] * len(every), every, fit.qpos, fit.qvel)
-        return Fit(hypothesis, fit.qpos, fit.qvel, residual, fit.start_jacobian)
-
     def residuals(self, settings, which, qpos, qvel, refine=1):
         """(S, m): S simulations, the i-th in window which[i] under settings[i] from (qpos[i], qvel[i])."""
         which, block = np.asarray(which), max(1, int(BLOCK_BYTES / (8 * self.size)))

@@ -134,7 +134,7 @@ def test_refining_converges(case):
     coarse, fine, finest = (simulate(world, [{}], recording, 8, refine=n)[0] for n in (1, 8, 32))
     assert abs(fine - finest).max() < max(0.5 * abs(coarse - finest).max(), 1e-6)
     step = world.candidate('time_step', 'world')
-    np.testing.assert_array_equal(simulate(world, [{step: (world.model.opt.timestep / 8,)}], recording, 8)[0], fine)
+    np.testing.assert_array_equal(simulate(world, [{step: (world.model.opt.timestep / 4,)}], recording, 8)[0], fine)
 
 
 def test_sensors_of_the_joints(case):
