@@ -2,6 +2,7 @@
 
     python benchmarks/trpo.py                                          # everything, one after the other
     python benchmarks/trpo.py --implementations ours --envs Hopper-v4 --seeds 0 1 2 --threads 1
+    python benchmarks/trpo.py --implementations ours --envs HalfCheetah-v4 --seeds 100 101 102 --max-kl 0.04
 
 Appends a row per finished training to results/trpo.csv and skips what is there, so parts may run side by side and
 be stopped at will. An environment is a gymnasium id, perturbed if a change follows: "Hopper-v4 torso:mass*1.27".
@@ -9,6 +10,7 @@ Each policy is judged by 20 episodes acting by its mean and 20 acting at random 
 """
 
 import argparse
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -22,7 +24,7 @@ sys.path.insert(0, str(ROOT))
 from benchmarks.rows import append, finished  # noqa: E402
 from envs import TASKS, BatchEnv, parse_perturbation  # noqa: E402
 from train import Settings, new_learner, seed_for  # noqa: E402
-from trpo import rollouts  # noqa: E402
+from trpo import PRESETS, rollouts  # noqa: E402
 
 STEPS = {"InvertedPendulum": 200_000, "Hopper": 1_000_000, "HalfCheetah": 1_000_000}
 ORIGINALS = [f"{name}-v4" for name in TASKS]
@@ -36,21 +38,20 @@ def make_env(name, num_envs, threads):
     return BatchEnv(env_id, num_envs, parse_perturbation(changes), nthread=threads)
 
 
-def train_ours(name, seed, steps, num_envs, threads):
+def train_ours(name, config, seed, steps, num_envs, threads):
     """The trained policy, exactly as train.py's pretraining makes it."""
     s = Settings(env=name.partition(" ")[0], seed=seed, num_envs=num_envs).completed()
     learner = new_learner(s)
+    learner.config = config
     learner.learn(make_env(name, num_envs, threads), steps, seed_for(seed, 0, "pretrain"), freeze_normalizer=False)
     return learner.policy
 
 
-def train_sb3(name, seed, steps, num_envs, threads):
-    """sb3-contrib's policy after as many steps with the same preset."""
+def train_sb3(name, config, seed, steps, num_envs, threads):
+    """sb3-contrib's policy after as many steps with the same settings."""
     from sb3_adapter import ActingPolicy, trpo_model
 
-    from trpo import PRESETS
-
-    model = trpo_model(make_env(name, num_envs, threads), PRESETS[name.partition("-")[0]], seed)
+    model = trpo_model(make_env(name, num_envs, threads), config, seed)
     model.learn(steps)
     return ActingPolicy(model)
 
@@ -64,6 +65,7 @@ def main(argv=None):
     parser.add_argument("--envs", nargs="+", help=f"default: {', '.join(ORIGINALS)}, and for ours these with the paper's changes")
     parser.add_argument("--seeds", nargs="+", type=int, help="default: 0..4 for ours, 0..2 for sb3-contrib")
     parser.add_argument("--steps", type=int, help="default: 200k for the pendulum, 1M otherwise")
+    parser.add_argument("--max-kl", type=float, help="instead of the preset's; the column `implementation` then tells it too")
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--num-envs", type=int, default=32)
     parser.add_argument("--threads", type=int, default=0, help="cores for each training (default: all)")
@@ -73,13 +75,16 @@ def main(argv=None):
         torch.set_num_threads(args.threads)
     for implementation in args.implementations:
         for name in args.envs or ORIGINALS + PERTURBED * (implementation == "ours"):
-            steps = args.steps or STEPS[name.partition("-")[0]]
+            task = name.partition("-")[0]
+            steps, config, label = args.steps or STEPS[task], PRESETS[task], implementation
+            if args.max_kl:
+                config, label = dataclasses.replace(config, max_kl=args.max_kl), f"{implementation} max_kl={args.max_kl:g}"
             for seed in args.seeds or range(SEEDS[implementation]):
-                key = {"implementation": implementation, "env": name, "seed": seed, "steps": steps}
+                key = {"implementation": label, "env": name, "seed": seed, "steps": steps}
                 if finished(args.results, key):
                     continue
                 start = time.process_time()
-                policy = IMPLEMENTATIONS[implementation](name, seed, steps, args.num_envs, args.threads)
+                policy = IMPLEMENTATIONS[implementation](name, config, seed, steps, args.num_envs, args.threads)
                 seconds = time.process_time() - start
                 env = make_env(name, args.episodes, args.threads)
                 judge = lambda deterministic: float(np.mean(rollouts(policy, env, args.episodes, 10_000 + seed, deterministic)[0]))
