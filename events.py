@@ -61,7 +61,8 @@ def find(world, problem, fit):
     rows = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
     if np.quantile(scan.chi2 / rows, 0.3) > QUIET:
         return None
-    excess = (scan.chi2 - np.quantile(scan.chi2, 0.3)).clip(0).sum()
+    usual = np.quantile(scan.chi2 / rows, 0.3) * (rows + 2 * np.sqrt(2 * rows))  # with the scatter of white noise
+    excess = (scan.chi2 - usual).clip(0).sum()
     best, everything = None, []
     recordings = list({id(w.recording): w.recording for w in problem.windows}.values())
     for (steady, timed), columns, step in zip(pairs, where, moves):

@@ -21,6 +21,7 @@ import events
 import findings
 import misfit
 import observer
+import scan
 import selection
 import shooting
 import unknown
@@ -266,9 +267,11 @@ def happened(data, hypothesis):
     """What came and went for a while, beside what lasts or instead of it: an Event, if it leaves less; else None."""
     problem = problem_of(*data, LEFTOVER_SPANS[0], FINAL_STEPS)
     lasting, found = shooting.fit_starts(problem, hypothesis), []
-    for h in dict.fromkeys((hypothesis, misfit.Hypothesis())):
+    noise = scan.freedom(problem)
+    instead = [hypothesis.minus(c) for c in hypothesis.candidates]  # what an event made look like something lasting
+    for h in dict.fromkeys((hypothesis, *instead, misfit.Hypothesis())):
         event = events.find(data[0], problem, lasting if h == hypothesis else shooting.fit_starts(problem, h))
-        if event and event.left < (1 - STAND_IN) * lasting.chi2.sum():
+        if event and event.left - noise < (1 - STAND_IN) * (lasting.chi2.sum() - noise):
             found.append(event)
     return min(found, key=lambda e: e.left) if found else None
 
