@@ -30,7 +30,7 @@ def earned(search, fit, windows, position_noise):
             far = fit.chi2.sum() > FAR * search.freedom
             without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
             gains = [scatter(windows, after, less) for less in without]
-            weak = [i for i, (gain, bound, whole) in enumerate(gains) if not gain > (max(bound, SLIGHT * whole) if far else -bound)
+            weak = [i for i, (gain, bound, whole) in enumerate(gains) if not gain > (max(bound, SLIGHT * whole) if far else 0.0)
                     and not (far and overall(without[i]) > (1 + SLIGHT) * overall(after))]
             if not weak:
                 break

@@ -106,7 +106,8 @@ def searched(data, say):
             break
         if much and not i:
             found = shorter(data, search, fit, span, say)
-            kept = found if found[2] < span else None
+            # of what reaches the noise in short windows and not in long ones, the start states are wrong there
+            kept = found if found[2] < span and found[1].chi2.sum() < selection.FAR * found[0].problem.rows else None
             search, fit, span = found
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
@@ -119,9 +120,9 @@ def shorter(data, search, fit, span, say):
     What longer windows said, wrong as its value may be for start states that stuck there, is a beginning in these.
     """
     world, train = data[:2]
-    less_span = span
-    while less_span > LEAST_ROWS * cut.sampling(train):
-        less_span /= 3
+    less_span, shortest = span, least(train) * cut.sampling(train)
+    while less_span > 1.5 * shortest:
+        less_span = max(less_span / 3, shortest)
         say(0.15, f"searching {len(world.candidates)} candidates in {less_span:.2g} s windows")
         other, less, _ = sought(world, train, problem_of(*data, less_span, SEARCH_STEPS), misfit.Hypothesis())
         if fit.hypothesis.effects:

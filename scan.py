@@ -17,6 +17,7 @@ import scores
 import shooting
 
 WORTH, WORTH_MISFIT = 0.03, 0.1  # least fall of the squared residual that an effect must bring; where it is far above the noise
+FLEXIBLE = "inertia", "nonlinear_stiffness"  # with many ways to bend, they too come late
 PROMISING = 12  # options, at least, that are looked at anew after every addition
 FEW = 16  # windows, at least, of a refit that only has to tell hypotheses apart
 
@@ -155,7 +156,7 @@ class Scan:
         Flexible effects that can look like several simple ones (ripples, bends, gaps) come late, when those are exhausted.
         """
         options = [o for o in self.options if o.candidate not in fit.hypothesis.candidates
-                   and (late or (o.linear or o.candidate.effect.simplicity < 2) and o.candidate.effect.name != "inertia")]
+                   and (late or (o.linear or o.candidate.effect.simplicity < 2) and o.candidate.effect.name not in FLEXIBLE)]
         options = [o for o in options if o.linear] + self.screened(fit, [o for o in options if not o.linear])
         # an option that promises little with the columns it had at an earlier fit is not simulated anew at this one
         older = [o for o in options if o in self.looked and self.looked[o][0] is not fit]

@@ -19,7 +19,7 @@ UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a par
 GOOD = 0.5  # share of the fall of the squared residual that a Jacobian promised, from which on it is kept
 STUCK = 0.02  # share of the squared residual that start states found anew have to spare
 POOR = 4.0  # standard deviations of noise's square by which a window leaves more than the best quarter, that make it poor
-FIRST, LED, LEADS = 3, 4, 2  # rows that a start is led from; iterations each time; steps of the parameters at which it is done
+FIRST, LED, LEADS = (8, 3), 4, 2  # rows that a start is led from (far apart: 3); iterations each time; steps of the parameters at which it is done
 KEPT = 8  # fits of start states that are remembered
 
 
@@ -124,22 +124,23 @@ def _descended(problem, settings, which, qpos, qvel, residual, jacobian, iterati
 
 
 def led(problem, fits):
-    """Fits with the start states of their poor windows sought again where rows are far apart: from the observer on, for the
-    first rows alone, then for more and more.
+    """Fits with the start states of their poor windows sought again: for the first rows alone, then for more and more.
 
-    Between such rows feet meet the ground; a state that leads through some rows nearly leads through the next, and any
-    other start ends in a local minimum. Windows are poor beside the best quarter of their fit.
+    Where feet meet the ground or friction sticks, a state that leads through some rows nearly leads through the next, and
+    any other start ends in a local minimum. Windows are poor beside the best quarter of their fit. Where rows are far apart
+    it begins with the observer's state and three rows, else with the recorded one and eight.
     """
-    if not problem.far_apart or not fits:
-        return fits
     free = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
     each = np.array([f.chi2 / free for f in fits])
     owner, which = np.nonzero(each > (1 + POOR * np.sqrt(2 / free)) * np.quantile(each, 0.25, axis=1, keepdims=True))
     if not len(which):
         return fits
     settings = [fits[h].hypothesis.settings for h in owner]
-    qpos, qvel = observed(problem.world, [problem.windows[w] for w in which], settings)
-    rows, longest = FIRST, problem.weight.shape[1]
+    if problem.far_apart:
+        qpos, qvel = observed(problem.world, [problem.windows[w] for w in which], settings)
+    else:
+        qpos, qvel = problem.guess_qpos[which], problem.guess_qvel[which]
+    rows, longest = FIRST[int(problem.far_apart)], problem.weight.shape[1]
     while True:
         part = problem.first_rows(rows) if rows < longest else problem
         residual = part.residuals(settings, which, qpos, qvel)
@@ -209,7 +210,8 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
     far = [h for h in range(len(hypotheses)) if current[h].chi2.sum() > 1.01 * warm[h].chi2.sum()]
     for h, fit in zip(far, follow(problem, [current[h] for h in far], iterations=3)):
         current[h] = fit
-    current = led(problem, current)
+    leads = LEADS if problem.far_apart else 0  # of rows close together start states follow by themselves, or are renewed later
+    current = led(problem, current) if leads else current
     damping = np.full(len(hypotheses), 1e-3)
     moving = [h for h in range(len(hypotheses))]
     for iteration in range(iterations):
@@ -235,7 +237,7 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
             take = lambda x, y: np.where(pick == 0, x, y)
             tried.append(Fit(trial[a][0], take(trial[a][1], trial[b][1]), take(trial[a][2], trial[b][2]),
                              take(residual[a], residual[b]), current[h].start_jacobian))
-        for h, fit in zip(moving, led(problem, tried) if iteration < LEADS else tried):
+        for h, fit in zip(moving, led(problem, tried) if iteration < leads else tried):
             old, new = cost(problem, current[h]), cost(problem, fit)
             if new < old:
                 current[h] = fit
