@@ -76,6 +76,12 @@ class JointNumber(JointEffect):
         step = max(self.step * M, 0.01 * abs(nominal))
         return Parameter(name, self.unit(model, i, *units), nominal, low, HUGE * M, step),
 
+    @staticmethod
+    def scaled(parameter, size):
+        """The parameter with a step and bounds that are the usual forces where it acts `size` times as much as at one."""
+        p = parameter
+        return replace(p, step=max(p.step / size, 0.01 * abs(p.nominal)), low=min(p.low, p.low / size), high=max(p.high, p.high / size))
+
     def edit(self, model, i, values):
         field, k = self._field(model, i)
         field[k] = values[0]
@@ -110,8 +116,7 @@ class QuadraticDamping(JointNumber):
     number, compiled, authored = ('damping2', 'N·m·s²/rad²', 'N·s²/m²'), ('dof_dampingpoly', 0), ('damping', 1)
 
     def suited(self, parameters, model, i, recordings):
-        _, fastest = self.reach(model, i, recordings)
-        return replace(parameters[0], step=max(parameters[0].step / fastest, 0.01 * abs(parameters[0].nominal))),
+        return self.scaled(parameters[0], self.reach(model, i, recordings)[1]),
 
     def far(self, model, i, recordings):
         return [(strength * self.scale(model, i) / self.reach(model, i, recordings)[0],) for strength in STRENGTHS]
@@ -152,8 +157,7 @@ class NonlinearStiffness(JointNumber):
     step, signed = 0.1, True
 
     def suited(self, parameters, model, i, recordings):
-        farthest, _ = self.reach(model, i, recordings)
-        return replace(parameters[0], step=max(parameters[0].step / farthest**2, 0.01 * abs(parameters[0].nominal))),
+        return self.scaled(parameters[0], self.reach(model, i, recordings)[0]**2),
 
     def far(self, model, i, recordings):
         farthest, fastest = self.reach(model, i, recordings)

@@ -7,6 +7,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 from plants import MODELS, SIZES, START, arm, pendulum, record, simulate, stock
 
 from physics import EFFECTS
@@ -150,11 +151,27 @@ def test_probes_show_something(case):
     world, _, recording = case
     recording.qpos = simulate(world, [{}], recording)[0]
     for candidate in world.candidates:
-        rows = world.probes(candidate, [recording])
+        candidate = world.suited(candidate, [recording])
+        rows = np.array([*world.probes(candidate, [recording]), *world.far(candidate, [recording])])
         low, high = (np.array([getattr(p, bound) for p in candidate.parameters]) for bound in ('low', 'high'))
         assert rows.ndim == 2 and rows.shape[1] == len(low) and len(rows), candidate
         assert (((rows >= low) & (rows <= high)) | np.isinf(rows)).all(), candidate
         assert not (rows == candidate.nominal).all(axis=1).any()
+
+
+@given(st.floats(0.01, 30), st.floats(0.01, 30))
+def test_small_steps_are_forces_of_one_size_whatever_the_motion(reach, speed):
+    """k·x³ and d·v² at the farthest and fastest row, against the steps of a motion of size one."""
+    world = World(mujoco.MjSpec.from_string('''<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body>
+                                            </worldbody></mujoco>'''))
+    there_and_back = reach * np.array([0.0, 1.0, 0.0, -1.0] * 50)
+    time = reach / speed * np.arange(len(there_and_back))
+    recording = SimpleNamespace(qpos=there_and_back[:, None], time=time)
+    for effect, size in (('nonlinear_stiffness', reach**2), ('quadratic_damping', speed)):
+        candidate = world.candidate(effect, 'x')
+        [usual], [suited] = candidate.parameters, world.suited(candidate, [recording]).parameters
+        assert suited.step * size == pytest.approx(usual.step, rel=1e-6)
+        assert suited.low <= usual.low <= suited.nominal == usual.nominal < usual.high <= suited.high
 
 
 def test_related_sit_at_the_same_joint(case):
