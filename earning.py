@@ -1,10 +1,10 @@
-"""Does every effect earn its keep? The reported error of recordings that a fit was not made from, with it and without it.
+"""Does every effect earn its keep? The reported error with it, its value as other recordings say, and without it, refitted.
 
     fit = earned(search, fit, windows, position_noise)      # without the effects that do not
 
 The search judges by windows whose start states are fitted, where a small effect shows best. Where that model reaches the
-noise it is to be trusted; where it does not, an effect may only bend towards another that is missing, and has to show
-in the reported error too: by more than that scatters between recordings or stretches of them, or clearly in all.
+noise it is to be trusted, if prediction gains at all; where it does not, an effect may only bend towards another that is
+missing, and has to show in the reported error too: by more than that scatters between recordings or stretches of them, or clearly in all.
 """
 
 import numpy as np
@@ -30,11 +30,12 @@ def earned(search, fit, windows, position_noise):
             far = fit.chi2.sum() > FAR * search.freedom
             without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
             gains = [scatter(windows, after, less) for less in without]
-            weak = [i for i, (gain, bound, whole) in enumerate(gains) if not gain > (max(bound, SLIGHT * whole) if far else 0.0)
+            # what no measured position sees, velocities may: it is not judged here
+            weak = [i for i, (gain, bound, whole) in enumerate(gains) if gain and not gain > (max(bound, SLIGHT * whole) if far else 0.0)
                     and not (far and overall(without[i]) > (1 + SLIGHT) * overall(after))]
             if not weak:
                 break
-            gone = candidates[min(weak, key=lambda i: gains[i][0] / max(gains[i][1], 1e-300))]
+            gone = candidates[min(weak, key=lambda i: gains[i][0] / max(gains[i][1], 1e-9))]
         else:  # what only stands in for something else goes first
             gone = max(candidates, key=lambda c: (c.effect.name == "unknown", search.significance(fit, c)[0]))
         fit = search.without(fit, gone)

@@ -7,6 +7,7 @@ unless a class overrides it:
     command   the control on its way               push     a constant force
     force     a force that depends on the state    measure  the sensor
     write     the same in MJCF                     probes   values worth a try
+    suited    steps for the motion recorded        far      values to try at full size
 
 Values are absolute, in SI units, with the sign of the MJCF field. A new effect
 is one class with the decorator @catalogue and no other line.

@@ -115,12 +115,13 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
             "evidence": {"held_out_error_removed": removed(without, after, before),
                          "p_value": search.significance(fit, candidate)[0]},
             "depends_on": list(left.variables) if curve else depends_on(model, candidate),
-            "when": region(candidate.effect, values, bounds[candidate], travel(model, train, candidate)) if curve else None, "written_as": written[candidate],
+            "when": region(candidate.effect, values, bounds[candidate], travel(model, train, candidate)) if curve else None,
+            "written_as": written[candidate],
             "also_possible": also_possible(search, fit, train, noise, candidate, possible.get(candidate, [])),
             **({"curve": form} if curve else {})})
     if event:
         findings.append(event_finding(event, train))
-    findings += sensors.faults(world, settings, train, position_noise, velocity_noise)
+    findings += sensors.faults(world, settings, train, position_noise, velocity_noise, event)
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     summary = {"format": 1, "verdict": "mismatch" if findings else "match",
                "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,

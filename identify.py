@@ -11,6 +11,7 @@
 Held-out recordings enter only after everything is chosen and fitted.
 """
 
+import warnings
 from dataclasses import replace
 
 import mujoco
@@ -38,6 +39,7 @@ STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up t
 GROSS = 5.0  # residual of a window over the usual one, that it may count for
 MUCH, UNFOUND = 4.0, 0.05  # squared residual, over the noise's and the nominal model's, above which shorter windows are tried
 LONGER = 1.3  # times what the shortest windows leave, up to which rows far apart are followed
+UNLIKELY = 3.0  # standard deviations of the squared residual, that an event must spare
 ROUNDS = 3  # of search, each with longer windows
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
@@ -86,7 +88,8 @@ def identify(world, train, held_out, progress=None):
 def searched(data, say):
     """Rounds of search with longer and longer windows: (Search, Fit, first ranking, last span).
 
-    Where the first leaves much unfound, windows were too long for that: motion far off is soon not linear.
+    Where the first leaves much, windows were too long for that: motion far off is soon not linear, and start states stick. If
+    what shorter ones say reaches the noise there and not in longer ones, the shorter ones have the last word.
     """
     world, train = data[:2]
     hypothesis, ranking, span, kept = misfit.Hypothesis(), [], 0.0, None
@@ -197,7 +200,7 @@ def windows_for(world, recordings, span, steps, event=None):
 
 
 def least(recordings):
-    """Rows of the shortest windows: where rows are far apart much happens between two."""
+    """Intervals between rows in the shortest windows: where rows are far apart much happens between two."""
     return LEAST_APART if observer.far_apart(recordings) else LEAST_ROWS
 
 
@@ -223,7 +226,8 @@ def follows(problem, fit, share_allowed):
     if missed(problem, fit) < FOLLOWS:
         return True
     gap = fit.residual[:, :size].reshape(weight.shape) / np.where(weight > 0, weight, np.inf)
-    moved = np.nanstd(cut.difference(problem.model, problem.measured_qpos[:, :1], problem.measured_qpos), axis=1)
+    with warnings.catch_warnings(action="ignore"):  # what was never measured has no spread
+        moved = np.nanstd(cut.difference(problem.model, problem.measured_qpos[:, :1], problem.measured_qpos), axis=1)
     share = np.sqrt((gap[..., :problem.model.nv] ** 2).mean(1)) / np.maximum(moved, 1e-12)
     return bool(np.nanmedian(share) < share_allowed)
 
@@ -269,10 +273,12 @@ def happened(data, hypothesis):
     problem = problem_of(*data, LEFTOVER_SPANS[0], FINAL_STEPS)
     lasting, found = shooting.fit_starts(problem, hypothesis), []
     noise = scan.freedom(problem)
+    total = lasting.chi2.sum()
+    notable = max(STAND_IN * (total - noise), UNLIKELY * np.sqrt(2 * noise))  # of white noise's scatter
     instead = [hypothesis.minus(c) for c in hypothesis.candidates]  # what an event made look like something lasting
     for h in dict.fromkeys((hypothesis, *instead, misfit.Hypothesis())):
         event = events.find(data[0], problem, lasting if h == hypothesis else shooting.fit_starts(problem, h))
-        if event and event.left - noise < (1 - STAND_IN) * (lasting.chi2.sum() - noise):
+        if event and event.left < total - notable:
             found.append(event)
     return min(found, key=lambda e: e.left) if found else None
 
@@ -280,8 +286,9 @@ def happened(data, hypothesis):
 def anything_left(data, search, hypothesis, possible):
     """(hypothesis, large Leftover or None, small one or None, what else is possible): what the residual depends on.
 
-    possible: {candidate: [(error ratio, other candidate, values), ...]}, as settle returns it. Named effects that only stood in for it go, all of them or one after the other: where it explains as much without
-    them, and much more than they do without it.
+    possible: {candidate: [(error ratio, other candidate, values), ...]}, as settle returns it. Named effects that only stood
+    in for what is left go, all of them or one after the other: where it explains as much without them, and much more than
+    they do without it.
     """
     hint, best = None, None
     shortest = LEAST_ROWS * cut.sampling(data[1])

@@ -45,7 +45,6 @@ class JointEffect(Effect):
         speed = [np.diff(r.qpos[k, q]) / np.diff(r.time[k]) for r, k in zip(recordings, known)]
         return np.concatenate([r.qpos[k, q] for r, k in zip(recordings, known)]), abs(np.concatenate(speed))
 
-
     def reach(self, model, i, recordings):
         """How far from its spring's rest, and how fast, the joint was recorded, but for the odd row."""
         position, speed = self.travel(model, i, recordings)
@@ -256,7 +255,7 @@ class Cogging(JointEffect):
         """At least one whole wave within the recorded travel: less is only a bent spring."""
         amplitude, poles, phase = parameters
         travel = np.ptp(self.travel(model, i, recordings)[0])
-        return amplitude, replace(poles, low=max(poles.low, 2 * np.pi / max(travel, 1e-9))), phase
+        return amplitude, replace(poles, low=min(max(poles.low, 2 * np.pi / max(travel, 1e-9)), poles.high)), phase
 
     def probes(self, model, i, recordings):
         """Ripples close enough to each other for one of them to stay in step over the whole travel."""
@@ -265,7 +264,7 @@ class Cogging(JointEffect):
         if turns(model, i) and travel > 5:
             poles = np.arange(1, 25)
         else:
-            poles = np.arange(2.0, 80.0, 2.0) / travel
+            poles = np.arange(6.5, 80.0, 2.0) / travel
         farthest, fastest = self.reach(model, i, recordings)
         amplitude = max(0.05, 0.1 * fastest**2 / farthest) * self.scale(model, i)  # too little does not show beside dry friction
         return np.array([(amplitude, n, phase) for n in poles for phase in (0.0, np.pi / 2)])

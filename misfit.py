@@ -119,7 +119,7 @@ class Problem:
         out.windows = [w._replace(last=min(w.last, w.first + number - 1)) for w in self.windows]
         for name in ("measured_qpos", "measured_qvel", "weight"):
             setattr(out, name, getattr(self, name)[:, :number])
-        out.size = out.weight[0].size + 2 * self.model.nv
+        out.size, out.rows = out.weight[0].size + 2 * self.model.nv, int(out.weight.astype(bool).sum())
         return out
 
     def weighted(self, fit, factor):

@@ -25,7 +25,8 @@ def simulate(model, recording, first, last, columns):
     Actuator states and delayed controls come from the control before `first`, the mechanism held where it was recorded;
     before the recording's first row it is that row's."""
     data = mujoco.MjData(model)
-    ahead = BEFORE if model.na or (model.actuator_delay > 0).any() else 0.0
+    before = round(BEFORE / model.opt.timestep) if model.na or (model.actuator_delay > 0).any() else 0  # steps
+    ahead = before * model.opt.timestep
     start = recording.time[first] - ahead  # where data.time is 0
     at = lambda: max(0, int(np.searchsorted(recording.time, start + data.time + 1e-9, side="right")) - 1)
 
@@ -33,18 +34,21 @@ def simulate(model, recording, first, last, columns):
         data.qpos[columns[0]] = np.where(np.isnan(recording.qpos[row]), data.qpos[columns[0]], recording.qpos[row])
         data.qvel[columns[1]] = velocity(model, recording, row, columns)
 
-    while data.time < ahead - 0.5 * model.opt.timestep:
+    out = np.full((last - first + 1, recording.qpos.shape[1]), np.nan)
+    broken = lambda: any(data.warning[k].number for k in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL,
+                                                          mujoco.mjtWarning.mjWARN_BADQACC))
+    for _ in range(before):
         put(at())
         data.ctrl[:recording.ctrl.shape[1]] = recording.ctrl[at()]
         mujoco.mj_step(model, data)
+        if broken():  # which sets the time back
+            return out
     put(first)
-    out = np.full((last - first + 1, recording.qpos.shape[1]), np.nan)
     for row in range(first, last + 1):
         while data.time < recording.time[row] - start - 0.5 * model.opt.timestep:
             data.ctrl[:recording.ctrl.shape[1]] = recording.ctrl[max(first, at())]
             mujoco.mj_step(model, data)
-            if any(data.warning[k].number for k in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL,
-                                                    mujoco.mjtWarning.mjWARN_BADQACC)):
+            if broken():
                 return out
         out[row - first] = data.qpos[columns[0]]
     return out

@@ -69,9 +69,14 @@ def write(diagnosis, out):
     return list(files)
 
 
+def reads_files(xml):
+    """Whether MJCF names files of meshes, textures or height fields."""
+    return bool(re.search(r'\sfile\w*="', xml))
+
+
 def portable(xml, out):
     """MJCF for folder `out`: where it reads files, folders of meshes and textures as seen from there, else without them."""
-    reads = re.search(r'\sfile="', xml)
+    reads = reads_files(xml)
 
     def seen(match):
         attribute, folder = match[1], html.unescape(match[2])
@@ -381,7 +386,7 @@ def _about(diagnosis):
     notes = "".join(f"<li>{E(note)}</li>" for note in summary.get("warnings", []))
     noise = ", ".join(f"{wording.channel_words(name)} {wording.number(value, 2)}" for name, value in summary["noise"].items())
     train, held = (_names(part) for part in (diagnosis.train, diagnosis.held_out))
-    files = "; it reads meshes and textures from where the nominal model has them" if 'file="' in diagnosis.corrected_xml else ""
+    files = "; it reads meshes and textures from where the nominal model has them" if reads_files(diagnosis.corrected_xml) else ""
     more = ", and unknown_<n>.csv (a force without a name, as a curve)" if unknown_curves(diagnosis) else ""
     return _section("The recordings",
                     f"<p>Fitted: {E(train)}.<br>Held out: {E(held)}.<br>Noise of the sensors (SI): {E(noise)}.</p>",

@@ -10,18 +10,20 @@ of sensors of motion: forces are the model's own, and where they differ it may b
 import mujoco
 import numpy as np
 
+import events
 import evidence
 import misfit
 import scores
 import shooting
 import windows as cut
+from effects import SLIDE
 
 LEVEL = 1e-3  # false-alarm rate, shared between all sensors and faults
 EXPLAINED = 0.8  # of what lies above a sensor's noise, the share that its fault must explain
 LATE = 0.1  # s, of a window, before which a late sensor would read what was before it
 SAME = 0.05  # errors closer than this cannot be told apart
 MOTION = "rad", "rad/s", "rad/s²", "m", "m/s", "m/s²"
-UNITS = {"rad": "JOINTPOS BALLQUAT FRAMEQUAT", "rad/s": "JOINTVEL GYRO BALLANGVEL FRAMEANGVEL", "rad/s²": "FRAMEANGACC",
+UNITS = {"rad": "JOINTPOS", "rad/s": "JOINTVEL GYRO BALLANGVEL FRAMEANGVEL", "rad/s²": "FRAMEANGACC",
          "m": "TENDONPOS FRAMEPOS RANGEFINDER SUBTREECOM GEOMDIST", "m/s": "TENDONVEL VELOCIMETER FRAMELINVEL SUBTREELINVEL",
          "m/s²": "ACCELEROMETER FRAMELINACC", "N": "TOUCH FORCE", "N·m": "TORQUE", "T": "MAGNETOMETER", "J": "E_POTENTIAL E_KINETIC"}
 
@@ -40,9 +42,14 @@ def unit(model, name):
     """The SI unit of a sensor, "" where it has none or it depends on what it is at."""
     i = model.sensor(name).id
     kind = mujoco.mjtSensor(model.sensor_type[i])
-    if kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL) and model.jnt_type[model.sensor_objid[i]] == 2:
+    if kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL) and model.jnt_type[model.sensor_objid[i]] == SLIDE:
         return "m" if kind == mujoco.mjtSensor.mjSENS_JOINTPOS else "m/s"
     return next((u for u, kinds in UNITS.items() if kind.name.removeprefix("mjSENS_") in kinds.split()), "")
+
+
+def turns(model, name):
+    """Whether a sensor gives quaternions."""
+    return model.sensor_type[model.sensor(name).id] in (int(mujoco.mjtSensor.mjSENS_BALLQUAT), int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
 
 
 def measured(windows, name, width):
@@ -64,7 +71,10 @@ def errors(world, settings, recordings):
     for name, columns in known:
         seen = measured(windows, name, columns.stop - columns.start)[:, 1:]
         here = np.isfinite(seen)
-        gaps = {k: np.where(np.isfinite(p[:, 1:, columns]), p[:, 1:, columns], np.inf)[here] - seen[here] for k, p in predicted.items()}
+        at_hand = {k: np.where(np.isfinite(p[:, 1:, columns]), p[:, 1:, columns], np.inf) for k, p in predicted.items()}
+        if turns(world.model, name):  # q and -q are the same rotation
+            at_hand = {k: np.where((p * seen).sum(-1, keepdims=True) < 0, -p, p) for k, p in at_hand.items()}
+        gaps = {k: p[here] - seen[here] for k, p in at_hand.items()}
         noise = [cut.difference_noise(r.sensors[name][:, k]) for r in recordings if name in r.sensors for k in range(seen.shape[-1])]
         if here.any():
             out[name] = {**{k: float(np.sqrt(np.mean(gap**2))) for k, gap in gaps.items()},
@@ -72,12 +82,14 @@ def errors(world, settings, recordings):
     return out
 
 
-def faults(world, settings, train, position_noise, velocity_noise, most=100):
-    """[finding] for every sensor of which a bias, a scale or a delay explains nearly all that the corrected model leaves."""
+def faults(world, settings, train, position_noise, velocity_noise, event=None, most=100):
+    """[finding] for every sensor of which a bias, a scale or a delay explains nearly all that the corrected model leaves.
+
+    event: of the recordings, in whose time nothing is looked for, or None."""
     known, out = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION], []
     if not known:
         return out
-    windows = evidence.consecutive(train, cut.HORIZON)
+    windows = [w for r in train for first, end in events.quiet(r, event) for w in cut.consecutive(r, cut.HORIZON, first, end)]
     windows = windows[:: -(-len(windows) // most)]
     fit = shooting.fit_starts(misfit.Problem(world, windows, position_noise, velocity_noise),
                               misfit.Hypothesis(tuple(settings.items())), sharp=False)

@@ -19,7 +19,8 @@ UNSEEN = 1e-6  # squared change of all predictions, in noises, under which a par
 GOOD = 0.5  # share of the fall of the squared residual that a Jacobian promised, from which on it is kept
 STUCK = 0.02  # share of the squared residual that start states found anew have to spare
 POOR = 4.0  # standard deviations of noise's square by which a window leaves more than the best quarter, that make it poor
-FIRST, LED, LEADS = (8, 3), 4, 2  # rows that a start is led from (far apart: 3); iterations each time; steps of the parameters at which it is done
+FIRST = 8, 3  # rows that a start is led from; where they are far apart
+LED, LEADS = 4, 2  # iterations each time; steps of the parameters at which it is done
 KEPT = 8  # fits of start states that are remembered
 
 
@@ -198,7 +199,7 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
     """Fit hypotheses side by side, every one with start states of its own: list of Fit.
 
     warm: a Fit whose start states and start Jacobian begin every hypothesis, or a list of them. Parameters stay
-    inside their bounds; a step is damped until the squared residual falls.
+    inside their bounds; a step is damped until the cost falls (the squared residual; where rows are far apart see cost).
     """
     if not hypotheses:
         return []
@@ -321,7 +322,7 @@ def _propose(fit, slope, moves, damping, robust):
     if robust:
         each = np.concatenate([np.einsum("wkk->wk", normal), (residual**2).sum(1)[:, None]], 1)
         usual = np.median(each, 0)
-        weight = np.where(each > usual, usual / np.maximum(each, 1e-300), 1.0)[:, usual > UNSEEN].min(1)
+        weight = np.where(each > usual, usual / np.maximum(each, 1e-300), 1.0)[:, usual > UNSEEN].min(1, initial=1.0)
         normal, push = normal * weight[:, None, None], push * weight[:, None]
     normal, push = normal.sum(0), push.sum(0)
     vector = fit.hypothesis.vector

@@ -331,6 +331,42 @@ def names(diagnosis):
     return [(f["effect"], f["place"]["name"]) for f in diagnosis.summary["findings"]]
 
 
+PAIR = """<mujoco><option timestep="0.005"/><default><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass=".5" contype="0"
+  conaffinity="0"/></default><worldbody><body><joint name="j" axis="0 1 0" damping=".05"/><geom/></body>
+  <body pos="0 1 0"><joint name="k" axis="0 1 0" damping="{damping}"/><geom/></body></worldbody>
+  <actuator><motor name="m" joint="j"/><motor name="n" joint="k"/></actuator></mujoco>"""
+
+
+def beside(seed, damping):
+    """Two pendulums that share nothing, one with its position measured, one with its velocity."""
+    model, rng = mujoco.MjModel.from_xml_string(PAIR.format(damping=damping)), np.random.default_rng(seed)
+    data, rows = mujoco.MjData(model), 400
+    qpos, qvel, ctrl = np.full((rows, 2), np.nan), np.full((rows, 2), np.nan), np.repeat(rng.uniform(-0.6, 0.6, (rows // 20, 2)), 20, 0)
+    for t in range(rows):
+        qpos[t, 0], qvel[t, 1] = data.qpos[0] + NOISE * rng.normal(), data.qvel[1] + 0.01 * rng.normal()
+        data.ctrl[:] = ctrl[t]
+        mujoco.mj_step(model, data, 2)
+    return Recording(f"run{seed}.csv", 0.01 * np.arange(rows), qpos, qvel, ctrl, {})
+
+
+def test_what_only_velocities_show_is_found():
+    runs = [beside(seed, 0.12) for seed in range(3)]
+    diagnosis = identify(World(mujoco.MjSpec.from_string(PAIR.format(damping=0.05))), runs[:2], runs[2:])
+    assert names(diagnosis) == [("viscous_damping", "k")]
+    assert diagnosis.summary["findings"][0]["parameters"][0]["value"] == pytest.approx(0.12, rel=0.02)
+
+
+def test_seldom_and_mostly_unmeasured_rows_can_be_solved():
+    run = recorded("seldom.csv", 0, damping=0.1)
+    seldom = Recording(run.name, run.time[::3], run.qpos[::3].copy(), run.qvel[::3], run.ctrl[::3], {})
+    seldom.qpos[:80] = np.nan
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    problem = misfit.Problem(world, cut.consecutive(seldom, 0.2), np.array([NOISE]), np.array([np.inf]))
+    begun = misfit.Hypothesis().plus(world.candidate("viscous_damping", "pivot"), (0.06,))
+    [fit] = shooting.solve(problem, [begun], shooting.fit_starts(problem, misfit.Hypothesis()))
+    assert fit.hypothesis.vector[0] > 0.06
+
+
 DROP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="5 5 .1" solref="-4000 {damping}"/>
   <body name="block" pos="0 0 .05"><joint name="z" type="slide" axis="0 0 1" damping="0.3"/>
   <geom name="block" type="box" size=".08 .08 .05" mass="1" solref="-4000 {damping}"/></body></worldbody></mujoco>"""

@@ -152,8 +152,8 @@ def test_probes_show_something(case):
     recording.qpos = simulate(world, [{}], recording)[0]
     for candidate in world.candidates:
         rows = np.array([*world.probes(candidate, [recording]), *world.far(candidate, [recording])])
-        both = candidate.parameters, world.suited(candidate, [recording]).parameters
-        low, high = np.min([[p.low for p in ps] for ps in both], 0), np.max([[p.high for p in ps] for ps in both], 0)
+        suited = world.suited(candidate, [recording]).parameters
+        low, high = (np.array([getattr(p, bound) for p in suited]) for bound in ('low', 'high'))
         assert rows.ndim == 2 and rows.shape[1] == len(low) and len(rows), candidate
         assert (((rows >= low) & (rows <= high)) | np.isinf(rows)).all(), candidate
         assert not (rows == candidate.nominal).all(axis=1).any()

@@ -322,6 +322,11 @@ def test_motion_runs_on_from_the_control_before_it(memory):
     assert abs(qpos).max() > 0.1
 
 
+def test_sides_of_a_cube_are_files_too(tmp_path):
+    xml = f'<mujoco><compiler texturedir="{tmp_path}/t"/><asset><texture name="c" type="cube" fileright="a.png"/></asset></mujoco>'
+    assert 'texturedir="t"' in report.portable(xml, tmp_path)
+
+
 @pytest.mark.parametrize("used", [True, False])
 def test_corrected_file_finds_meshes_from_the_report_wherever_both_go(tmp_path, used):
     parts, out = tmp_path / "here/model/parts & more", tmp_path / "here/report"

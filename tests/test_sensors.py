@@ -87,3 +87,19 @@ def test_a_fault_is_named_with_its_size(effect, name, value, fault):
     [p] = found["parameters"]
     assert (found["effect"], found["place"]) == (effect, {"kind": "sensor", "name": name})
     assert p["value"] == pytest.approx(value, rel=0.05) and p["low"] < p["value"] < p["high"] and found["written_as"] == "measurement"
+
+
+def test_the_two_quaternions_of_a_rotation_are_one():
+    xml = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body><joint name="a" axis="0 1 0"/><geom size=".1" mass="1"/>
+      <site name="s"/></body></worldbody><sensor><framequat name="q" objtype="site" objname="s"/></sensor></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, qpos, quat = mujoco.MjData(model), np.empty((400, 1)), np.empty((400, 4))
+    data.qvel[:] = 6.0
+    for t in range(400):
+        mujoco.mj_forward(model, data)
+        qpos[t], quat[t] = data.qpos, data.sensordata
+        mujoco.mj_step(model, data, 5)
+    quat *= np.where(quat[:, :1] < 0, -1, 1)  # as many devices give it
+    run = Recording("r.csv", 0.01 * np.arange(400), qpos, np.full((400, 1), np.nan), np.zeros((400, 0)), {"q": quat})
+    found = sensors.errors(World(mujoco.MjSpec.from_string(xml)), {}, [run])["q"]
+    assert found["before"] < 1e-3 and found["after"] < 1e-3
