@@ -95,12 +95,8 @@ def squares(world, settings, windows, noise):
     settings: one for each window.
     """
     predicted = world.simulate(settings, *cut.recorded_starts(world.model, windows), windows)[0]
-    residual = cut.position_residual(world.model, windows, predicted)[:, 1:]
-    measured = cut.measured(windows)[:, 1:]
-    known = np.isfinite(cut.difference(world.model, measured, measured))
-    with np.errstate(invalid="ignore", over="ignore"):
-        square = np.where(known, np.where(np.isfinite(residual), residual / noise, np.inf) ** 2, 0.0)
-    return square.sum((1, 2)), known.sum((1, 2))
+    square, known = cut.squares(world.model, windows, predicted)
+    return (square / noise**2).sum((1, 2)), known.sum((1, 2))
 
 
 def overall(parts):

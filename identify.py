@@ -189,11 +189,11 @@ def lowered_noise(world, train, position, velocity, hypothesis):
 
 def windows_for(world, recordings, span, steps, event=None):
     """Windows of span seconds spread evenly over the recordings, at most `steps` simulated steps in all."""
-    every = []
+    every, fewest = [], least(recordings)
     for r in recordings:
         sample = np.median(np.diff(r.time))
         for first, end in events.quiet(r, event):
-            every += cut.consecutive(r, max(span, least(recordings) * sample), first, end)
+            every += cut.consecutive(r, max(span, fewest * sample), first, end)
     duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
     number = max(LEAST_WINDOWS, int(steps / dear(world.model) * world.model.opt.timestep / duration))
     return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]

@@ -118,7 +118,8 @@ class QuadraticDamping(JointNumber):
         return self.scaled(parameters[0], self.reach(model, i, recordings)[1]),
 
     def far(self, model, i, recordings):
-        return [(strength * self.scale(model, i) / self.reach(model, i, recordings)[0],) for strength in STRENGTHS]
+        farthest, _ = self.reach(model, i, recordings)
+        return [(strength * self.scale(model, i) / farthest,) for strength in STRENGTHS]
 
 
 @catalogue

@@ -69,6 +69,12 @@ class Fit:
         """(W,) squared residual of every window."""
         return (self.residual**2).sum(1)
 
+    def better(self, other):
+        """Every window as in this fit, or as in another of the same hypothesis where that leaves less."""
+        less = other.chi2 < self.chi2
+        take = lambda x, y: x if x is y else np.where(less.reshape(-1, *[1] * (x.ndim - 1)), y, x)
+        return Fit(self.hypothesis, *(take(getattr(self, x), getattr(other, x)) for x in ("qpos", "qvel", "residual", "start_jacobian")))
+
     def subset(self, keep):
         return Fit(self.hypothesis, self.qpos[keep], self.qvel[keep], self.residual[keep], self.start_jacobian[keep])
 

@@ -62,6 +62,11 @@ def measured(windows, name, width):
     return out
 
 
+def noise_of(recordings, name):
+    """Usual noise of a sensor's columns."""
+    return float(np.median([cut.difference_noise(column) for r in recordings if name in r.sensors for column in r.sensors[name].T]))
+
+
 def errors(world, settings, recordings):
     """{sensor: {"before", "after", "noise": RMS over windows as of the reported error, "unit"}}; infinite where it blows up."""
     known, windows, out = recorded(world.model, recordings), evidence.consecutive(recordings, cut.HORIZON), {}
@@ -75,10 +80,9 @@ def errors(world, settings, recordings):
         if turns(world.model, name):  # q and -q are the same rotation
             at_hand = {k: np.where((p * seen).sum(-1, keepdims=True) < 0, -p, p) for k, p in at_hand.items()}
         gaps = {k: p[here] - seen[here] for k, p in at_hand.items()}
-        noise = [cut.difference_noise(r.sensors[name][:, k]) for r in recordings if name in r.sensors for k in range(seen.shape[-1])]
         if here.any():
             out[name] = {**{k: float(np.sqrt(np.mean(gap**2))) for k, gap in gaps.items()},
-                         "noise": float(np.median(noise)), "unit": unit(world.model, name)}
+                         "noise": noise_of(recordings, name), "unit": unit(world.model, name)}
     return out
 
 
@@ -127,7 +131,7 @@ def faults(world, settings, train, position_noise, velocity_noise, event=None, m
 def finding(world, name, candidate, value, gram, score, left, bare, rows, tests, train):
     """The finding of a sensor's fault from sums over clusters of windows (C,), or None where it is not sure enough."""
     p = candidate.parameters[0]
-    noise = np.median([cut.difference_noise(column) for r in train if name in r.sensors for column in r.sensors[name].T])
+    noise = noise_of(train, name)
     if len(gram) < 3 or not bare.sum() - left.sum() > EXPLAINED * max(bare.sum() - rows * noise**2, 0.2 * bare.sum()):
         return None
     whole = score + gram * (value - p.nominal)  # as seen from the sound sensor, its slope taken as here

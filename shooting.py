@@ -65,13 +65,10 @@ def fit_starts(problem, hypothesis, iterations=12, sharp=True):
 def renewed(problem, fit, most=3):
     """The fit with start states found anew where that leaves less, for they may have stuck on the way; solved again then."""
     for _ in range(most):
-        fresh = fit_starts(problem, fit.hypothesis)
-        better = fresh.chi2 < fit.chi2
-        if np.minimum(fresh.chi2, fit.chi2).sum() > (1 - STUCK) * fit.chi2.sum():
+        begun = fit.better(fit_starts(problem, fit.hypothesis))
+        if begun.chi2.sum() > (1 - STUCK) * fit.chi2.sum():
             break
-        parts = ((getattr(fresh, x), getattr(fit, x)) for x in ("qpos", "qvel", "residual", "start_jacobian"))
-        merged = Fit(fit.hypothesis, *(np.where(better.reshape(-1, *[1] * (x.ndim - 1)), x, y) for x, y in parts))
-        [fit] = solve(problem, [fit.hypothesis], merged, iterations=4)
+        [fit] = solve(problem, [fit.hypothesis], begun, iterations=4)
     return fit
 
 
@@ -233,11 +230,8 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
         residual = residual.reshape(len(trial), number, -1)
         still, polish, tried = [], [], []
         for i, h in enumerate(moving):
-            a, b = 2 * i, 2 * i + 1
-            pick = np.argmin((residual[[a, b]] ** 2).sum(-1), 0)[:, None]
-            take = lambda x, y: np.where(pick == 0, x, y)
-            tried.append(Fit(trial[a][0], take(trial[a][1], trial[b][1]), take(trial[a][2], trial[b][2]),
-                             take(residual[a], residual[b]), current[h].start_jacobian))
+            moved, kept = (Fit(*trial[k], residual[k], current[h].start_jacobian) for k in (2 * i, 2 * i + 1))
+            tried.append(moved.better(kept))
         for h, fit in zip(moving, led(problem, tried) if iteration < leads else tried):
             old, new = cost(problem, current[h]), cost(problem, fit)
             if new < old:
@@ -281,9 +275,7 @@ def _polish(problem, current, which):
                                  np.concatenate([m[1] for m in moved]))
     for h, (qpos, qvel), r in zip(which, moved, np.split(residual, len(which))):
         fit = current[h]
-        better = ((r**2).sum(1) < fit.chi2)[:, None]
-        current[h] = Fit(fit.hypothesis, np.where(better, qpos, fit.qpos), np.where(better, qvel, fit.qvel),
-                         np.where(better, r, fit.residual), fit.start_jacobian)
+        current[h] = fit.better(Fit(fit.hypothesis, qpos, qvel, r, fit.start_jacobian))
 
 
 def evaluate(problem, hypotheses, warm):

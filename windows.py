@@ -177,16 +177,24 @@ def position_residual(model, windows, qpos):
     return difference(model, qpos, measured(windows))
 
 
+def squares(model, windows, qpos):
+    """What the reported error sums: squared residuals (W, T - 1, nv), 0 where nothing was measured, and where something was.
+
+    Row 0 of a window is the start and does not count. A prediction that blew up counts as infinite.
+    """
+    residual, rows = position_residual(model, windows, qpos)[:, 1:], measured(windows)[:, 1:]
+    known = np.isfinite(difference(model, rows, rows))
+    residual = np.where(known & ~np.isfinite(residual), np.inf, residual)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.where(known, residual**2, 0.0), known
+
+
 def error(model, windows, qpos, noise):
     """The reported error of predictions qpos (W, T, nq): over all channels (in noises), and per channel (SI).
 
-    noise (nv,). Row 0 of a window is the start and does not count. A prediction that blew up counts as infinite.
+    noise (nv,).
     """
-    residual = position_residual(model, windows, qpos)[:, 1:]
-    known = np.isfinite(difference(model, measured(windows)[:, 1:], measured(windows)[:, 1:]))
-    residual = np.where(known & ~np.isfinite(residual), np.inf, residual)
-    with np.errstate(invalid="ignore"):
-        square = np.where(known, residual**2, 0.0)
+    square, known = squares(model, windows, qpos)
     per_channel = {}
     for name, dofs in channels(model).items():
         if known[..., dofs].any():
