@@ -200,7 +200,7 @@ def nominal_delay(model, i):
 @catalogue
 class DeadZone(ActuatorEffect):
     """Nothing happens below a threshold: of the control (motor) or of the force (servo)."""
-    name, simplicity, related = 'dead_zone', 2, ('coulomb_friction', 'gain')
+    name, simplicity, amplitudes, related = 'dead_zone', 2, 1, ('coulomb_friction', 'gain')
 
     def fits(self, model, i):
         return super().fits(model, i) and (not self._servo(model, i) or model.actuator_trntype[i] == JOINT_TRANSMISSION)

@@ -3,8 +3,8 @@
     fit = earned(search, fit, windows, position_noise)      # without the effects that do not
 
 The search judges by windows whose start states are fitted, where a small effect shows best. Where that model reaches the
-noise it is to be trusted, if prediction gains at all; where it does not, an effect may only bend towards another that is
-missing, and has to show in the reported error too: by more than that scatters between recordings or stretches of them, or clearly in all.
+noise it is to be trusted, unless prediction speaks against it; where it does not, an effect may only bend towards another that
+is missing, and has to show in the reported error too: by more than that scatters between recordings or stretches of them, or clearly in all.
 """
 
 import numpy as np
@@ -17,6 +17,7 @@ from selection import FAR
 
 WORSE, SLIGHT = 0.02, 0.01  # of the reported error: more is no accident; less is not worth an effect
 LEVEL = 0.95  # of Student's t, one-sided, beyond which a difference is more than scatter
+PLAIN = 0.5  # relative rise of the squared residual without an effect, from which on only clear harm speaks against it
 CAP = 10.0  # times the largest finite error of a window, that one which blows up counts for
 
 
@@ -25,14 +26,15 @@ def earned(search, fit, windows, position_noise):
     noise = evidence.reporting_noise(position_noise)
     while fit.hypothesis.effects:
         candidates = fit.hypothesis.candidates
-        before, after = (squares(search.world, s, windows, noise) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
+        before, after = (gaps(search.world, s, windows, noise) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
         if not overall(after) > (1 + WORSE) * overall(before):
             far = fit.chi2.sum() > FAR * search.freedom
             without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
             gains = [scatter(windows, after, less) for less in without]
             # what no measured position sees, velocities may: it is not judged here
             weak = [i for i, (gain, bound, whole) in enumerate(gains) if gain and not gain > (max(bound, SLIGHT * whole) if far else 0.0)
-                    and not (far and overall(without[i]) > (1 + SLIGHT) * overall(after))]
+                    and not (overall(without[i]) > (1 + SLIGHT) * overall(after) if far else there(windows, after, without[i])
+                             or gain > -bound and search.significance(fit, candidates[i])[1] > PLAIN)]
             if not weak:
                 break
             gone = candidates[min(weak, key=lambda i: gains[i][0] / max(gains[i][1], 1e-9))]
@@ -43,9 +45,9 @@ def earned(search, fit, windows, position_noise):
 
 
 def scatter(windows, one, other):
-    """(by how much the sum of windows' errors, each (squares (W,), counts (W,)), rises from one to the other, by how much that
-    may be scatter between clusters of them, the sum of one)."""
-    errors = np.sqrt([square / np.maximum(count, 1) for square, count in (one, other)])  # (2, W)
+    """(by how much the sum of windows' errors rises from one (gap, known) to the other, by how much that may be scatter between
+    clusters of them, the sum of one)."""
+    errors = np.sqrt([(gap**2).sum((1, 2)) / np.maximum(known.sum((1, 2)), 1) for gap, known in (one, other)])  # (2, W)
     finite = errors[np.isfinite(errors)]
     errors = np.minimum(errors, CAP * finite.max() if len(finite) else 1.0)
     rise = scores.summed(scores.clusters(windows), errors[1] - errors[0])
@@ -54,8 +56,24 @@ def scatter(windows, one, other):
     return rise.sum(), scores.t_quantile(len(rise) - 1, LEVEL) * np.sqrt(len(rise)) * rise.std(ddof=1), errors[0].sum()
 
 
+def there(windows, one, less):
+    """Whether what an effect adds to predictions may be in the measurements in full: their slope on it, from the gaps with it
+    (one) and without (less), is not clearly below one. Where noise in the start states grows fast, no error tells more."""
+    (one, _), (less, _) = one, less
+    finite = np.isfinite(one).all((1, 2)) & np.isfinite(less).all((1, 2))
+    one, less = (np.where(finite[:, None, None], gap, 0.0) for gap in (one, less))
+    added, weight = less - one, 1 / np.maximum((one**2 + less**2).sum((1, 2)), 1e-300)
+    labels = scores.clusters(windows)
+    own, along = (scores.summed(labels, weight * (x * added).sum((1, 2))) for x in (added, less))
+    if len(own) < 2 or not own.sum():
+        return False
+    slope = along.sum() / own.sum()
+    scatter = np.sqrt(len(own)) * (along - slope * own).std(ddof=1) / own.sum()
+    return slope > 1 - scores.t_quantile(len(own) - 1, LEVEL) * scatter
+
+
 def absent(search, fit, windows, noise, far):
-    """[squares] of windows without each effect of a fit, the others refitted: with care only where the model is far from the
+    """[gaps] of windows without each effect of a fit, the others refitted: with care only where the model is far from the
     noise, for else nothing but harm is looked for."""
     shorter = [fit.hypothesis.minus(c) for c in fit.hypothesis.candidates]
     if far:
@@ -63,7 +81,7 @@ def absent(search, fit, windows, noise, far):
         fits = shooting.solve(search.problem, [f.hypothesis for f in fits], fit, iterations=1)
     else:
         fits = shooting.solve(search.scouting, shorter, fit.subset(search.scouts), iterations=2)
-    return [squares(search.world, [f.hypothesis.settings] * len(windows), windows, noise) for f in fits]
+    return [gaps(search.world, [f.hypothesis.settings] * len(windows), windows, noise) for f in fits]
 
 
 def elsewhere(search, fit, windows):
@@ -89,17 +107,17 @@ def elsewhere(search, fit, windows):
     return [settings[block(w)] for w in windows]
 
 
-def squares(world, settings, windows, noise):
-    """(squared error in noises summed over the rows of each window (W,), number of rows that count (W,)), starts as recorded.
+def gaps(world, settings, windows, noise):
+    """(measured less predicted, in noises, 0 where nothing was measured (W, T - 1, nv), where something was), starts as recorded.
 
     settings: one for each window.
     """
     predicted = world.simulate(settings, *cut.recorded_starts(world.model, windows), windows)[0]
-    square, known = cut.squares(world.model, windows, predicted)
-    return (square / noise**2).sum((1, 2)), known.sum((1, 2))
+    gap, known = cut.gaps(world.model, windows, predicted)
+    return gap / noise, known
 
 
 def overall(parts):
     """The error of all windows."""
-    square, count = parts
-    return float(np.sqrt(square.sum() / max(count.sum(), 1)))
+    gap, known = parts
+    return float(np.sqrt((gap**2).sum() / max(known.sum(), 1)))

@@ -83,6 +83,7 @@ class Effect:
     constants = False  # edit() changes something that mj_setConst derives constants from
     timed = False      # differs from a simpler effect only under a condition
     amplitudes = 0     # of an effect with probes: how many of its first parameters it acts in proportion to
+    together = 1       # of an effect with probes: how many in a row are tried as one
     simplicity = 1     # 0 for the first things to think of, up to 3
     related = ()       # names of effects at the same joint in whose wrong value this one may hide
 
@@ -118,6 +119,10 @@ class Effect:
         rows = [nominal[:k] + [p.nominal + d] + nominal[k + 1:]
                 for k, p in enumerate(parameters) for d in (p.step, -p.step) if p.low <= p.nominal + d <= p.high]
         return np.array(rows)
+
+    def merged(self, rows, amounts):
+        """(values, amount): the one probe, and how much of it, that does what these probes in these amounts do."""
+        return rows[0], amounts[0]
 
     def far(self, model, i, recordings):
         """Values (P, parameters) to try besides a small step: so far off an effect no longer acts in proportion."""

@@ -77,8 +77,9 @@ class Real:
         elif effect == "armature":
             model.dof_armature[self._dof(item)] = p["armature"]
         elif effect == "contact_friction" and not self._slides(item):
-            model.geom_friction[model.geom(name).id, 0] = p["sliding"]
-            model.geom_priority[model.geom(name).id] = 1
+            geom = model.geom(name).id
+            model.geom_friction[geom, 0] = p["sliding"]
+            model.geom_priority[geom], model.geom_condim[geom] = 1, model.geom_condim.max()  # else its own condim would count alone
         elif effect == "contact_friction":           # the slider: smooth contacts, friction by hand
             model.geom_condim[:] = 1
         elif effect in ("contact_stiffness", "contact_damping"):

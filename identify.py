@@ -40,7 +40,7 @@ GROSS = 5.0  # residual of a window over the usual one, that it may count for
 MUCH, UNFOUND = 4.0, 0.05  # squared residual, over the noise's and the nominal model's, above which shorter windows are tried
 LONGER = 1.3  # times what the shortest windows leave, up to which rows far apart are followed
 UNLIKELY = 3.0  # standard deviations of the squared residual, that an event must spare
-ROUNDS = 3  # of search, each with longer windows
+ROUNDS, MORE = 3, 1.5  # of search, each with windows longer by this at least
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
 
@@ -96,7 +96,7 @@ def searched(data, say):
     for i in range(ROUNDS):
         say(0.05 + 0.15 * i, "choosing windows")
         longer = span_for(*data, hypothesis, at_least=span)
-        if i and longer < 1.5 * span:
+        if i and longer < MORE * span:
             break
         say(0.1 + 0.15 * i, f"searching {len(world.candidates)} candidates in {longer:.2g} s windows")
         search, fit, before = sought(world, train, problem_of(*data, longer, SEARCH_STEPS), hypothesis)
@@ -124,7 +124,7 @@ def shorter(data, search, fit, span, say):
     """
     world, train = data[:2]
     less_span, shortest = span, least(train) * cut.sampling(train)
-    while less_span > 1.5 * shortest:
+    while less_span > MORE * shortest:
         less_span = max(less_span / 3, shortest)
         say(0.15, f"searching {len(world.candidates)} candidates in {less_span:.2g} s windows")
         other, less, _ = sought(world, train, problem_of(*data, less_span, SEARCH_STEPS), misfit.Hypothesis())
@@ -246,6 +246,8 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
         return float(duration)
     enough = sum(np.ptp(r.time) for r in train) / 12  # clusters need windows
     longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration, enough))
+    if longest < MORE * at_least:
+        return at_least
 
     def fitted(span):
         problem = problem_of(world, train, position_noise, velocity_noise, event, span, SEARCH_STEPS / 4)

@@ -241,7 +241,7 @@ class SpringOffset(JointEffect):
 @catalogue
 class Cogging(JointEffect):
     """Force amplitude·sin(poles·q + phase), as of a motor's magnets."""
-    name, simplicity, amplitudes = 'cogging', 3, 1
+    name, simplicity, amplitudes, together = 'cogging', 3, 1, 2
 
     def fits(self, model, i):
         return super().fits(model, i) and self.driven(model, i)
@@ -265,10 +265,14 @@ class Cogging(JointEffect):
         if turns(model, i) and travel > 5:
             poles = np.arange(1, 25)
         else:
-            poles = np.arange(6.5, 80.0, 2.0) / travel
+            poles = np.arange(6.5, 80.0, 3.0) / travel
         farthest, fastest = self.reach(model, i, recordings)
         amplitude = max(0.05, 0.1 * fastest**2 / farthest) * self.scale(model, i)  # too little does not show beside dry friction
         return np.array([(amplitude, n, phase) for n in poles for phase in (0.0, np.pi / 2)])
+
+    def merged(self, rows, amounts):
+        wave = sum(amount * row[0] * np.exp(1j * row[2]) for row, amount in zip(rows, amounts))
+        return (rows[0][0], rows[0][1], float(np.angle(wave))), abs(wave) / rows[0][0]
 
     def canonical(self, values):
         amplitude, poles, phase = values

@@ -11,10 +11,12 @@ import mujoco
 import numpy as np
 
 import surroundings  # noqa: F401, I001  (their effects join the catalogue, in this order)
-import joints        # noqa: F401
+from joints import JointEffect
 import actuators     # noqa: F401
 from effects import (EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, Place,  # noqa: F401  (EFFECTS to others)
                      angle, catalogue, constant_force, turns)
+
+REST, RESTING = 0.02, 0.05  # share of a joint's travel about its end, and of all rows found there, where it seems to lie at its stop
 
 
 def explicit_inertia(spec, model):
@@ -172,6 +174,16 @@ class SensorEffect(Effect):
     def fits(self, model, i):
         return self.kind == 'sensor' or model.jnt_type[i] in (HINGE, SLIDE)
 
+    def stops(self, model, i, recordings):
+        """[(reading, end of the range)] where the joint seems to lie at its stop: there a sensor's fault shows at once."""
+        limited = self.kind == 'joint' and model.jnt_limited[i]
+        position = JointEffect.travel(model, i, recordings)[0] if limited else ()
+        if not len(position):
+            return []
+        ends = np.quantile(position, (RESTING / 2, 1 - RESTING / 2))  # beyond it lie a few rows of impacts
+        near = [position[abs(position - end) < REST * np.ptp(position)] for end in ends]
+        return [(float(np.median(x)), float(stop)) for x, stop in zip(near, model.jnt_range[i]) if len(x) > RESTING * len(position)]
+
     def write(self, spec, model, i, values):
         return 'measurement'
 
@@ -184,6 +196,9 @@ class SensorBias(SensorEffect):
     def parameters(self, model, i):
         unit = 'sensor' if self.kind == 'sensor' else 'rad' if turns(model, i) else 'm'
         return Parameter('offset', unit, 0.0, -HUGE, HUGE, 0.002),
+
+    def far(self, model, i, recordings):
+        return [(seen - stop,) for seen, stop in self.stops(model, i, recordings)]
 
     def measure(self, values):
         return values[0], 1.0, 0.0
@@ -212,6 +227,9 @@ class SensorScale(SensorEffect):
 
     def parameters(self, model, i):
         return Parameter('ratio', '1', 1.0, 0.1, 10.0, 0.005),
+
+    def far(self, model, i, recordings):
+        return [(seen / stop,) for seen, stop in self.stops(model, i, recordings) if stop and 0.1 < seen / stop < 10]
 
     def measure(self, values):
         return 0.0, values[0], 0.0

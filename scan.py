@@ -69,7 +69,8 @@ def options_of(world, recordings):
             continue
         candidate = world.suited(candidate, recordings)
         if candidate.effect.overrides("probes"):
-            out += [Option(candidate, (tuple(float(v) for v in row),), False) for row in world.probes(candidate, recordings)]
+            rows, n = [tuple(float(v) for v in row) for row in world.probes(candidate, recordings)], candidate.effect.together
+            out += [Option(candidate, tuple(rows[k:k + n]), False) for k in range(0, len(rows), n)]
         else:
             moved = shooting.perturbed(misfit.Hypothesis(((candidate, candidate.nominal),)))[0]
             out.append(Option(candidate, tuple(m[candidate] for m in moved), True))
@@ -100,6 +101,7 @@ class Scan:
         self.scout_labels = np.unique(by_window[self.scouts].ravel(), return_inverse=True)[1]
         self.ranking, self.kept = [], set()
         self.looked = {}  # {option: (fit, its columns there)}
+        self.scouted = None, None, {}  # fit, its part on the scouts, {option: its columns there}
 
     def worth(self, fit):
         """Least fall of the squared residual: more where no hypothesis comes near the noise, and small gains mean little."""
@@ -124,7 +126,7 @@ class Scan:
         Columns over all windows are kept: those of the same fit are not simulated again.
         """
         base, whole = shooting.perturbed(fit.hypothesis)[0], problem is self.problem
-        known = {o: columns for o, (_, columns) in self.looked.items()} if whole else {}
+        known = {o: columns for o, (_, columns) in self.looked.items()} if whole else self.scouted[2]
         slope = self.stacked(problem, fit, base, options, known)
         if whole:
             self.looked |= {o: (fit, known[o]) for o in options if o not in self.looked}
@@ -167,7 +169,9 @@ class Scan:
 
     def screened(self, fit, options, most=16):
         """The most promising of the many probes of effects without gradient, looked at in few windows."""
-        found, _, _, chi2 = self.scan(fit.subset(self.scouts), options, self.scouting)
+        if self.scouted[0] is not fit:
+            self.scouted = fit, fit.subset(self.scouts), {}
+        found, _, _, chi2 = self.scan(self.scouted[1], options, self.scouting)
         out, count = [], {}
         for t in found:
             candidate = t.option.candidate
@@ -200,13 +204,14 @@ class Scan:
         parameters = option.candidate.parameters
         nominal = np.array([p.nominal for p in parameters])
         low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
+        rows = [np.array(option.directions[c - where[0]]) for c in columns]
         if not option.linear:
-            probe, n = np.array(option.directions[0]), option.candidate.effect.amplitudes
+            (probe, amount), n = option.candidate.effect.merged(rows, value), option.candidate.effect.amplitudes
             if n:  # in proportion to these it is linear; a ripple may be turned round, friction may not
-                start = np.r_[np.clip(value[0] * probe[:n], low[:n], high[:n]), probe[n:]]
+                start = np.r_[np.clip(amount * np.array(probe[:n]), low[:n], high[:n]), probe[n:]]
                 return tuple(start) if start[0] else None
-            return tuple(probe) if value[0] > 0.05 else None
-        move = sum(v * (np.array(option.directions[c - where[0]]) - nominal) for c, v in zip(columns, value))
+            return tuple(probe) if amount > 0.05 else None
+        move = sum(v * (row - nominal) for v, row in zip(value, rows))
         start = np.clip(nominal + move, low, high)
         if np.all(np.abs(start - nominal) < 1e-3 * np.abs(move)):
             return None

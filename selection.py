@@ -12,13 +12,14 @@ import numpy as np
 
 import scores
 import shooting
-from scan import WORTH, Scan
+from scan import WORTH, Scan, Trial
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 # in squared residual: of a parameter; of an effect one level less simple; up to which few windows do not decide between two
 PRICE, ODDS, DOUBT = 2.0, 2.0, 8.0
 FAR = 2.0  # squared residual over the noise's
 LESS = 0.03  # share of an effect, from whose absence that of the whole is extrapolated
+DOUBTFUL = 3  # candidates that are refitted for their gain alone, where much is left
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
 
 
@@ -54,7 +55,9 @@ class Search(Scan):
         level, worth = ALPHA / self.places, self.worth(fit)
         fair = [t for t in trials if t.start and t.p_value < HOPE and t.held > 0 and t.gain > 0.3 * worth * chi2]
         promising = {t.option.candidate for t in fair if t.p_value < 10 * level}
-        hopeful = [t for t in fair if t.option.candidate in promising][:looks]
+        if fit.chi2.sum() > FAR * self.freedom:  # a few windows whose start states stuck may scatter more than the others gain
+            promising |= set(list(dict.fromkeys(t.option.candidate for t in fair))[:DOUBTFUL])
+        hopeful = [t for t in fair if t.option.candidate in promising][:looks] + self.leaps(fit)
         tried = [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful]
         begun = shooting.evaluate(self.scouting, tried, fit.subset(self.scouts))
         left = [f.chi2.sum() for f in shooting.follow(self.scouting, begun, iterations=2)]
@@ -63,10 +66,23 @@ class Search(Scan):
             rivals = [j for j in chosen if self.alike(hopeful[i], hopeful[j], gram) and left[i] > 0.9 * left[j]]
             if len(chosen) < singles and i not in chosen and not rivals:
                 chosen.append(i)
+        chosen += [i for i in by_size if not hopeful[i].columns and i not in chosen][:1]  # start states soon stick at such a place
         out = [[(hopeful[i].option.candidate, hopeful[i].start)] for i in chosen]
         best = max((t.gain for t in trials if t.start), default=0.0)
         return out + [list(pair) for gain, *pair in self.pairs(trials, gram, score, doubles)
                       if gain > best + max(2 * worth * chi2, 0.1 * best)]
+
+    def leaps(self, fit, most=3):
+        """Far values that leave less than a fit at once, as Trials; sought where it leaves much, for no small step leads there."""
+        far = [o for o in self.options if not (o.linear or o.candidate.effect.overrides("probes"))
+               and o.candidate not in fit.hypothesis.candidates]
+        if fit.chi2.sum() < FAR * self.freedom:
+            return []
+        warm = fit.subset(self.scouts)
+        tried = [fit.hypothesis.plus(o.candidate, o.directions[0]) for o in far]
+        gain = [warm.chi2.sum() - f.chi2.sum() for f in shooting.evaluate(self.scouting, tried, warm)]
+        best = [i for i in np.argsort(gain)[::-1][:most] if gain[i] > self.worth(fit) * warm.chi2.sum()]
+        return [Trial(far[i], gain[i], 0.0, gain[i], far[i].directions[0], [], range(0), np.zeros(0), warm.chi2.sum()) for i in best]
 
     def choose(self, fit, fits, proposals):
         """The hypothesis that wins, refitted to all windows, as (Fit, added candidates); None when none earns its keep."""

@@ -15,6 +15,7 @@ import numpy as np
 from world import Window
 
 HORIZON = 0.3  # s, of the error that is reported
+ENDLESS = 1e100  # m or rad: whoever is farther off is nowhere
 
 # ---- joint coordinates -------------------------------------------------------------------------
 
@@ -177,16 +178,14 @@ def position_residual(model, windows, qpos):
     return difference(model, qpos, measured(windows))
 
 
-def squares(model, windows, qpos):
-    """What the reported error sums: squared residuals (W, T - 1, nv), 0 where nothing was measured, and where something was.
+def gaps(model, windows, qpos):
+    """Measured less predicted (W, T - 1, nv), 0 where nothing was measured, and where something was; what the reported error sums.
 
     Row 0 of a window is the start and does not count. A prediction that blew up counts as infinite.
     """
     residual, rows = position_residual(model, windows, qpos)[:, 1:], measured(windows)[:, 1:]
     known = np.isfinite(difference(model, rows, rows))
-    residual = np.where(known & ~np.isfinite(residual), np.inf, residual)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.where(known, residual**2, 0.0), known
+    return np.where(known, np.where(abs(residual) < ENDLESS, residual, np.inf), 0.0), known
 
 
 def error(model, windows, qpos, noise):
@@ -194,7 +193,8 @@ def error(model, windows, qpos, noise):
 
     noise (nv,).
     """
-    square, known = squares(model, windows, qpos)
+    gap, known = gaps(model, windows, qpos)
+    square = gap**2
     per_channel = {}
     for name, dofs in channels(model).items():
         if known[..., dofs].any():

@@ -200,7 +200,7 @@ def test_values_for_windows_are_those_that_other_recordings_say():
         others = misfit.Problem(world, [v for r in runs[:3] if r is not w.recording for v in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
         [alone] = shooting.solve(others, [fit.hypothesis], shooting.fit_starts(others, fit.hypothesis))
         assert s[damping][0] == pytest.approx(alone.hypothesis.vector[0], rel=0.01)
-    before, after = (earning.overall(earning.squares(world, s, windows, noise)) for s in ([{}] * len(windows), settings))
+    before, after = (earning.overall(earning.gaps(world, s, windows, noise)) for s in ([{}] * len(windows), settings))
     assert after < 0.5 * before
     assert after == pytest.approx(evidence.prediction_error(world, fit.hypothesis.settings, runs[1:], noise)[0], rel=0.02)
 
@@ -250,13 +250,26 @@ def test_what_stands_in_a_curves_place_brings_its_equals_along():
 
 def test_scatter_of_errors_between_recordings_is_students():
     rng, runs = np.random.default_rng(1), [SimpleNamespace(time=np.arange(9.0)) for _ in range(14)]
-    windows = [cut.Window(r, 0, 8) for r in runs]
-    one, other = rng.uniform(1, 2, (2, 14)) * 8
-    rise, bound, _ = earning.scatter(windows, (one, np.full(14, 8)), (other, np.full(14, 8)))
-    each = np.sqrt(other / 8) - np.sqrt(one / 8)
+    windows, known = [cut.Window(r, 0, 8) for r in runs], np.full((14, 8, 1), True)
+    one, other = rng.normal(0, 2, (2, 14, 8, 1))
+    rise, bound, _ = earning.scatter(windows, (one, known), (other, known))
+    each = (np.sqrt((x**2).mean((1, 2))) for x in (other, one))
+    each = np.subtract(*each)
     assert rise == pytest.approx(each.sum()) and bound == pytest.approx(1.7709 * each.std(ddof=1) * np.sqrt(14), rel=1e-3)
     other[3] = np.inf  # a window that blows up counts for ten of the worst
-    assert earning.scatter(windows, (one, np.full(14, 8)), (other, np.full(14, 8)))[0] > rise + 8 * np.sqrt(1)
+    assert earning.scatter(windows, (one, known), (other, known))[0] > rise + 8 * np.sqrt(1)
+
+
+def test_what_an_effect_adds_is_believed_where_the_measurements_may_hold_all_of_it():
+    rng, runs = np.random.default_rng(0), [SimpleNamespace(time=np.arange(9.0)) for _ in range(30)]
+    windows, known = [cut.Window(r, 0, 8) for r in runs], np.full((30, 8, 1), True)
+    believed = {0.0: 0, 1.0: 0}
+    for share in believed:
+        for _ in range(50):
+            added, noise = rng.normal(size=(2, 30, 8, 1))
+            less = share * added + 3 * noise  # noise much larger than what is added
+            believed[share] += earning.there(windows, (less - added, known), (less, known))
+    assert believed[1.0] >= 45 and believed[0.0] <= 5
 
 
 def test_what_a_motor_at_a_site_depends_on_is_no_joint():
