@@ -408,6 +408,39 @@ def test_what_shows_in_a_few_bounces_only_is_found():
     assert fit["after"] < fit["before"]
 
 
+FALL = """<mujoco><compiler angle="radian"/><option timestep="0.005"/><worldbody><body><joint name="x" axis="0 1 0" range="-1.4 1.4" damping=".05"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><motor name="m" joint="x"/></actuator></mujoco>"""
+
+
+def fallen(seed, ratio):
+    """An upright rod falls onto its stop and lies there, pushed at from time to time."""
+    rng, model = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(FALL)
+    data, qpos, ctrl = mujoco.MjData(model), np.empty((150, 1)), np.repeat(rng.uniform(-1, 1, (15, 1)), 10, 0)
+    data.qpos[:] = rng.uniform(0.05, 0.2)
+    for t in range(len(qpos)):
+        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
+        mujoco.mj_step(model, data, 4)
+    noisy = ratio * qpos + NOISE * rng.normal(size=qpos.shape)
+    return Recording(f"fall{seed}.csv", 0.02 * np.arange(len(qpos)), noisy, np.full(qpos.shape, np.nan), ctrl, {})
+
+
+def test_a_sensor_read_at_a_stop_is_found_though_no_small_step_leads_there():
+    runs = [fallen(seed, 0.85) for seed in range(4)]
+    [finding] = identify(World(mujoco.MjSpec.from_string(FALL)), runs[:3], runs[3:]).summary["findings"]
+    assert finding["effect"] == "sensor_scale"
+    assert finding["parameters"][0]["value"] == pytest.approx(0.85, rel=0.01)
+
+
+def test_far_values_are_looked_at_where_a_fit_leaves_much():
+    world, runs = World(mujoco.MjSpec.from_string(FALL)), [fallen(seed, 0.85) for seed in range(3)]
+    problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.2)], np.array([NOISE]), np.array([np.inf]))
+    search = selection.Search(world, problem, runs)
+    best, *_ = search.leaps(shooting.fit_starts(problem, misfit.Hypothesis()))
+    assert best.option.candidate.effect.name == "sensor_scale" and best.start[0] == pytest.approx(0.85, rel=0.01)
+    assert not search.leaps(shooting.fit_starts(problem, misfit.Hypothesis().plus(best.option.candidate, (0.85,))))
+
+
 def test_nothing_missing_is_a_match():
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
     runs = [recorded(f"run{k}.csv", k, seconds=4.0 if k < 2 else 40.0) for k in range(3)]  # an error in noise is itself chance

@@ -174,6 +174,30 @@ def test_small_steps_are_forces_of_one_size_whatever_the_motion(reach, speed):
         assert suited.low <= usual.low <= suited.nominal == usual.nominal < usual.high <= suited.high
 
 
+ROD = '''<mujoco><compiler angle="radian"/><worldbody><body><joint name="x" axis="0 1 0" range="-1.2 1.5"/><geom size=".1" pos="0 0 .3"/></body>
+  </worldbody><actuator><motor name="m" joint="x"/></actuator></mujoco>'''
+
+
+@given(*[st.floats(-5, 5)] * 2, st.floats(1, 20))
+def test_two_phases_of_a_ripple_make_one(sine, cosine, poles):
+    q, rows = np.linspace(-2, 2, 101), [np.array([0.3, poles, phase]) for phase in (0.0, np.pi / 2)]
+    effect = next(e for e in EFFECTS if e.name == 'cogging')
+    (amplitude, same, phase), amount = effect.merged(rows, (sine, cosine))
+    both = 0.3 * (sine * np.sin(poles * q) + cosine * np.cos(poles * q))
+    np.testing.assert_allclose(amount * amplitude * np.sin(same * q + phase), both, atol=1e-12)
+
+
+def test_a_joint_at_its_stop_shows_its_sensors_fault():
+    world = World(mujoco.MjSpec.from_string(ROD))
+    fall = np.r_[np.linspace(0, 1.3, 60), 1.35, 1.3, np.full(40, 1.3)]
+    recording = SimpleNamespace(qpos=fall[:, None], time=0.01 * np.arange(len(fall)))
+    values = {name: world.far(world.candidate(name, 'x'), [recording]) for name in ('sensor_scale', 'sensor_bias')}
+    np.testing.assert_allclose(values['sensor_scale'], [(1.3 / 1.5,)], rtol=1e-3)
+    np.testing.assert_allclose(values['sensor_bias'], [(1.3 - 1.5,)], rtol=1e-2)
+    moving = SimpleNamespace(qpos=np.sin(np.arange(100) / 5)[:, None] * np.linspace(1.3, 0.2, 100)[:, None], time=recording.time[:100])
+    assert not world.far(world.candidate('sensor_bias', 'x'), [moving])
+
+
 def test_related_sit_at_the_same_joint(case):
     world, _, _ = case
     related = world.related(world.candidate('coulomb_friction', 'elbow'))
