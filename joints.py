@@ -334,7 +334,7 @@ class Backlash(JointEffect):
     to ± gap/2 and in the middle at the start of a run, carries the load. The motor side
     needs inertia of its own: without armature it gets one per cent of the joint's.
     """
-    name, simplicity = 'backlash', 3
+    name, simplicity, amplitudes = 'backlash', 3, 1
 
     def fits(self, model, i):
         body = model.jnt_bodyid[i]

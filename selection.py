@@ -39,8 +39,10 @@ class Search(Scan):
             chosen = self.choose(fit, fits, proposals) if proposals else None
             if chosen is None and late:
                 break
-            late = chosen is None
-            refused = refused | {frozenset(c for c, _ in p) for p in proposals} if late else set()
+            # what a pair does, one of the flexible may do alone
+            doubled = chosen is not None and not late and len(chosen[1]) > 1
+            late = chosen is None or doubled
+            refused = refused | {frozenset(c for c, _ in p) for p in proposals} if chosen is None else set()
             if not late:
                 fit, added = chosen
                 fit = self.drop(shooting.renewed(self.problem, fit), added)
@@ -66,6 +68,8 @@ class Search(Scan):
             rivals = [j for j in chosen if self.alike(hopeful[i], hopeful[j], gram) and left[i] > 0.9 * left[j]]
             if len(chosen) < singles and i not in chosen and not rivals:
                 chosen.append(i)
+        same = lambda i: [j for j in by_size if self.alike(hopeful[i], hopeful[j], gram) and left[j] < (1 + WORTH) * left[i]]
+        chosen = [min(same(i), key=lambda j: simplicity(hopeful[j].option.candidate)) for i in chosen]
         chosen += [i for i in by_size if not hopeful[i].columns and i not in chosen][:1]  # start states soon stick at such a place
         out = [[(hopeful[i].option.candidate, hopeful[i].start)] for i in chosen]
         best = max((t.gain for t in trials if t.start), default=0.0)
@@ -122,14 +126,22 @@ class Search(Scan):
         while True:
             earlier = {c: self.significance(fit, c) for c in fit.hypothesis.candidates if c not in added}
             worth, level = self.worth(fit), ALPHA / self.places
-            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * worth or p > level]
-            for candidate in sorted(weak, key=lambda c: earlier[c][1]):
+            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * worth or p > level] + self.replaced(fit, earlier, added)
+            for candidate in sorted(set(weak), key=lambda c: earlier[c][1]):
                 less = self.without(fit, candidate)
                 if less.chi2.sum() < (1 + worth * (1 if earlier[candidate][0] < level else 3)) * fit.chi2.sum():
                     fit = less
                     break
             else:
                 return fit
+
+    def replaced(self, fit, earlier, added):
+        """Which earlier effects the added ones can do without, by refits on few windows: far from here no small step tells."""
+        if not added:
+            return []
+        small, listed = fit.subset(self.few), list(earlier)
+        fits = shooting.solve(self.small, [fit.hypothesis.minus(c) for c in listed], small, iterations=4)
+        return [c for c, f in zip(listed, fits) if f.chi2.sum() < (1 + self.worth(fit)) * small.chi2.sum()]
 
     def without(self, fit, candidate):
         """A fit with a candidate left out; what then has to go far away may begin there."""
@@ -180,13 +192,17 @@ class Search(Scan):
     def likeliest(self, fit, rivals, most=3):
         """The likeliest of rivals [(Fit on few windows, candidate)] of equally many parameters, refitted to all windows."""
         scale = fit.chi2.sum() / self.freedom  # what a squared residual is worth, whatever the noise was thought to be
-        odds = lambda fits, among: [f.chi2.sum() / scale + ODDS * c.effect.simplicity for f, (_, c) in zip(fits, among)]
+        odds = lambda fits, among: [f.chi2.sum() / scale + ODDS * c.effect.simplicity + self.wide(c) for f, (_, c) in zip(fits, among)]
         few = odds([f for f, _ in rivals], rivals)
         rivals = [rivals[i] for i in np.argsort(few, kind="stable")[:most] if few[i] < min(few) + DOUBT]
         if len(rivals) == 1:
             return rivals[0]
         fits = shooting.solve(self.problem, [f.hypothesis for f, _ in rivals], fit, iterations=3)
         return rivals[int(np.argmin(np.round(odds(fits, rivals), 1)))]
+
+    def wide(self, candidate):
+        """1 at a geom of the world, which many others may touch, else 0: the same at what touches it says less."""
+        return int(candidate.place.kind == "geom" and self.model.geom_bodyid[self.model.geom(candidate.place.name).id] == 0)
 
     def worse(self, one, other):
         """Whether a fit's squared residual (few windows) lies above another's beyond its scatter between clusters."""
