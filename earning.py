@@ -27,8 +27,9 @@ def earned(search, fit, windows, position_noise):
     while fit.hypothesis.effects:
         candidates = fit.hypothesis.candidates
         before, after = (gaps(search.world, s, windows, noise) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
-        if not overall(after) > (1 + WORSE) * overall(before):
-            far = fit.chi2.sum() > FAR * search.freedom
+        far = fit.chi2.sum() > FAR * search.freedom
+        rise, bound, _ = scatter(windows, before, after)
+        if not overall(after) > (1 + WORSE) * overall(before) or not far and rise < bound:
             without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
             gains = [scatter(windows, after, less) for less in without]
             # what no measured position sees, velocities may: it is not judged here

@@ -292,7 +292,10 @@ class Search(Scan):
         if pair:
             last = fits.pop()
             pair = last.hypothesis if last.chi2.sum() < (1 - 2 * WORTH) * small.chi2.sum() else None
-        return [(f, f.hypothesis.candidates[-1]) for f in fits], pair
+        best = {}
+        for f in sorted(fits, key=lambda f: f.chi2.sum()):
+            best.setdefault(f.hypothesis.candidates[-1], f)
+        return [(f, c) for c, f in best.items()], pair
 
 
 def solid(hypothesis):
