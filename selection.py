@@ -26,11 +26,11 @@ HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which 
 class Search(Scan):
     def run(self, fit, most=6):
         """Additions, drops and swaps from the nominal fit: a Fit."""
-        late, refused = False, set()
+        late, refused, pairs = False, set(), []
         for _ in range(most):
             trials, gram, score, chi2 = self.trials(fit, late)
             self.ranking = self.ranking or trials
-            proposals = [p for p in self.proposals(fit, trials, gram, score, chi2) if frozenset(c for c, _ in p) not in refused]
+            proposals = [p for p in self.proposals(fit, trials, gram, score, chi2) + pairs if frozenset(c for c, _ in p) not in refused]
             hypotheses = [fit.hypothesis for _ in proposals]
             for i, proposal in enumerate(proposals):
                 for candidate, start in proposal:
@@ -39,11 +39,12 @@ class Search(Scan):
             chosen = self.choose(fit, fits, proposals) if proposals else None
             if chosen is None and late:
                 break
-            # what a pair does, one of the flexible may do alone
-            doubled = chosen is not None and not late and len(chosen[1]) > 1
-            late = chosen is None or doubled
-            refused = refused | {frozenset(c for c, _ in p) for p in proposals} if chosen is None else set()
-            if not late:
+            if chosen is None:
+                late, refused = True, {frozenset(c for c, _ in p) for p in proposals}
+            elif len(chosen[1]) > 1 and not late:  # one of the flexible may do alone what this pair does
+                late, pairs = True, [[(c, chosen[0].hypothesis.settings[c]) for c in chosen[1]]]
+            else:
+                late, refused, pairs = False, set(), []
                 fit, added = chosen
                 fit = self.drop(shooting.renewed(self.problem, fit), added)
         return fit
