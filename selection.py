@@ -128,7 +128,7 @@ class Search(Scan):
             earlier = {c: self.significance(fit, c) for c in fit.hypothesis.candidates if c not in added}
             worth, level = self.worth(fit), ALPHA / self.places
             weak = [c for c, (p, cost) in earlier.items() if cost < 3 * worth or p > level] + self.replaced(fit, earlier, added)
-            for candidate in sorted(set(weak), key=lambda c: earlier[c][1]):
+            for candidate in sorted(dict.fromkeys(weak), key=lambda c: earlier[c][1]):
                 less = self.without(fit, candidate)
                 if less.chi2.sum() < (1 + worth * (1 if earlier[candidate][0] < level else 3)) * fit.chi2.sum():
                     fit = less
