@@ -27,8 +27,9 @@ def curves(rows):
     return table
 
 
-def panels(count, across=3):
+def panels(count):
     """A figure and its axes, one for each of `count` panels."""
+    across = 2 if count == 4 else 3
     rows = -(-count // across)
     figure = Figure(figsize=(4.6 * min(count, across), 3.7 * rows), layout="constrained")
     axes = list(figure.subplots(rows, min(count, across), squeeze=False).flat)
@@ -39,7 +40,8 @@ def panels(count, across=3):
 
 def draw_grounding(rows, best):
     """One panel per task: every seed thin, the mean thick with its standard error, both reference lines."""
-    table = {key: algos for key, algos in sorted(curves(rows).items()) if key[2] == "default"}
+    told = [(key, algos) for key, algos in curves(rows).items() if key[2] == "default"]
+    table = dict(sorted(told, key=lambda item: "Hopper" not in item[0][0]))  # where grounding shows, first
     figure, all_axes = panels(len(table))
     for axes, ((env, policy, _), algos) in zip(all_axes, table.items()):
         for algo, seeds in algos.items():
@@ -115,14 +117,16 @@ def trpo_table(rows):
 
 
 def settings_table(rows):
-    """Markdown: what a frozen policy returns in the grounded simulator under each variant, and the one-step error."""
+    """Markdown: what a frozen policy returns in the grounded simulator under each variant, and the one-step error; seed by seed."""
     print("\n| method | units of R_AT | f_ψ | γ_AT | max KL | std | error of f_ψ | one-step error | return, stochastic | deterministic |")
     print("|---|---|---|---|---|---|---|---|---|---|")
+    variants = {}
     for row in rows:
-        f_error = f"{float(row['forward_model_error']):.4f}" if row["forward_model_error"] else ""
-        told = [row[k] for k in ("method", "norm", "forward_model", "at_gamma", "at_max_kl", "at_std")]
-        returns = [f"{float(row[f'return_{k}']):.0f}" for k in ("stochastic", "deterministic")]
-        print("| " + " | ".join([*told, f_error, f"{float(row['one_step_error']):.4f}", *returns]) + " |")
+        variants.setdefault(tuple(row[k] for k in ("method", "norm", "forward_model", "at_gamma", "at_max_kl", "at_std")), []).append(row)
+    for told, of_seeds in variants.items():
+        shown = [("forward_model_error", ".4f"), ("one_step_error", ".4f"), ("return_stochastic", ".0f"), ("return_deterministic", ".0f")]
+        cells = [", ".join(f"{float(row[k]):{digits}}" for row in of_seeds if row[k]) for k, digits in shown]
+        print("| " + " | ".join([*told, *cells]) + " |")
 
 
 if __name__ == "__main__":
