@@ -16,7 +16,7 @@ import scores
 import shooting
 
 LEVEL = 1e-3  # false-alarm rate, shared between all intervals and effects
-CONCENTRATED, PROMISING = 0.8, 0.3  # of what lies above the usual residual, the share that the interval must explain; by a small step
+CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the interval must explain
 QUIET = 3.0  # squared residual over the noise's, of the windows without an event, above which something else is wrong
 ALONE = 0.9  # of an event's gain, the share of one window, above which that window is odd rather than an event
 LONGEST = 0.6  # of a recording: what lasts longer is no event
@@ -90,13 +90,11 @@ def find(world, problem, fit):
     gain, timed, values, r, a, b, k, spread = best
     count = len(problem.windows)
     p = scores.f_survival(gain / k / spread, k, max(count - k, 1)) * count**2 * len(pairs)
-    if p > LEVEL or gain < PROMISING * excess:
+    if p > LEVEL or gain < CONCENTRATED * excess:
         return None
     low, high = (np.array([getattr(q, f) for q in timed.parameters]) for f in ("low", "high"))
     time = r.time[problem.windows[a].first], r.time[problem.windows[b].last]
     event = refined(world, problem, fit, Event(None, tuple(np.clip(values, low, high)), r, time, float(min(p, 1))), timed)
-    if fit.chi2.sum() - event.left < CONCENTRATED * excess:
-        return None
     inside, others = [i for i in range(a, b + 1) if problem.windows[i].recording is r], []
     for other, columns, keep, step, score, gram in everything:
         if other != timed:
