@@ -13,7 +13,6 @@ import evidence
 import scores
 import shooting
 import windows as cut
-from selection import FAR
 
 WORSE, SLIGHT = 0.02, 0.01  # of the reported error: more is no accident; less is not worth an effect
 LEVEL = 0.95  # of Student's t, one-sided, beyond which a difference is more than scatter
@@ -27,22 +26,31 @@ def earned(search, fit, windows, position_noise):
     while fit.hypothesis.effects:
         candidates = fit.hypothesis.candidates
         before, after = (gaps(search.world, s, windows, noise) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
-        far = fit.chi2.sum() > FAR * search.freedom
+        far = search.leaves_much(fit)
         rise, bound, _ = scatter(windows, before, after)
         if not overall(after) > (1 + WORSE) * overall(before) or not far and rise < bound:
             without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
-            gains = [scatter(windows, after, less) for less in without]
-            # what no measured position sees, velocities may: it is not judged here
-            weak = [i for i, (gain, bound, whole) in enumerate(gains) if gain and not gain > (max(bound, SLIGHT * whole) if far else 0.0)
-                    and not (overall(without[i]) > (1 + SLIGHT) * overall(after) if far else there(windows, after, without[i])
-                             or gain > -bound and search.significance(fit, candidates[i])[1] > PLAIN)]
+            doubts = {c: doubt(search, fit, windows, c, after, less) for c, less in zip(candidates, without)}
+            weak = {c: d for c, d in doubts.items() if d is not None}
             if not weak:
                 break
-            gone = candidates[min(weak, key=lambda i: gains[i][0] / max(gains[i][1], 1e-9))]
+            gone = min(weak, key=weak.get)
         else:  # what only stands in for something else goes first
             gone = max(candidates, key=lambda c: (c.effect.name == "unknown", search.significance(fit, c)[0]))
         fit = search.without(fit, gone)
     return fit
+
+
+def doubt(search, fit, windows, candidate, after, less):
+    """What an effect gains over its scatter, where prediction speaks against it, else None. after, less: gaps with it and without."""
+    gain, bound, whole = scatter(windows, after, less)
+    if not gain:  # what no measured position sees, velocities may: it is not judged here
+        kept = True
+    elif search.leaves_much(fit):
+        kept = gain > max(bound, SLIGHT * whole) or overall(less) > (1 + SLIGHT) * overall(after)
+    else:
+        kept = gain > 0 or there(windows, after, less) or gain > -bound and search.significance(fit, candidate)[1] > PLAIN
+    return None if kept else gain / max(bound, 1e-9)
 
 
 def scatter(windows, one, other):
@@ -60,7 +68,7 @@ def scatter(windows, one, other):
 def there(windows, one, less):
     """Whether what an effect adds to predictions may be in the measurements in full: their slope on it, from the gaps with it
     (one) and without (less), is not clearly below one. Where noise in the start states grows fast, no error tells more."""
-    (one, _), (less, _) = one, less
+    one, less = one[0], less[0]
     finite = np.isfinite(one).all((1, 2)) & np.isfinite(less).all((1, 2))
     one, less = (np.where(finite[:, None, None], gap, 0.0) for gap in (one, less))
     added, weight = less - one, 1 / np.maximum((one**2 + less**2).sum((1, 2)), 1e-300)
@@ -69,8 +77,8 @@ def there(windows, one, less):
     if len(own) < 2 or not own.sum():
         return False
     slope = along.sum() / own.sum()
-    scatter = np.sqrt(len(own)) * (along - slope * own).std(ddof=1) / own.sum()
-    return slope > 1 - scores.t_quantile(len(own) - 1, LEVEL) * scatter
+    spread = np.sqrt(len(own)) * (along - slope * own).std(ddof=1) / own.sum()
+    return slope > 1 - scores.t_quantile(len(own) - 1, LEVEL) * spread
 
 
 def absent(search, fit, windows, noise, far):

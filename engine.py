@@ -42,12 +42,8 @@ class Engine:
         begin = np.array([w.recording.time[w.first] for w in windows]) - early
         q, v = self._true(start_qpos, start_qvel, measures)
         qpos, qvel = np.tile(self.model.qpos0, (len(cases), 1)), np.zeros((len(cases), self.model.nv))
-        if self.model.nq > self.nominal.nq:  # the same for all starts of a window under one setting
-            keys = list(zip(map(id, cases), map(id, recordings), begin))
-            first = {key: s for s, key in reversed(list(enumerate(keys)))}
-            once, back = list(first.values()), {key: k for k, key in enumerate(first)}
-            few = self._run_up([cases[s] for s in once], [windows[s] for s in once], begin[once], measures[:, once], step)
-            qpos, qvel = (x[[back[key] for key in keys]] for x in few)
+        if self.model.nq > self.nominal.nq:
+            qpos, qvel = self._run_up(cases, windows, begin, measures, step)
         qpos[:, self.q], qvel[:, self.v] = q, v
         if early.any():
             lead = int(np.ceil(early.max() / step)) + 1

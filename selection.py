@@ -58,7 +58,7 @@ class Search(Scan):
         level, worth = ALPHA / self.places, self.worth(fit)
         fair = [t for t in trials if t.start and t.p_value < HOPE and t.held > 0 and t.gain > 0.3 * worth * chi2]
         promising = {t.option.candidate for t in fair if t.p_value < 10 * level}
-        if fit.chi2.sum() > FAR * self.freedom:  # a few windows whose start states stuck may scatter more than the others gain
+        if self.leaves_much(fit):  # a few windows whose start states stuck may scatter more than the others gain
             promising |= set(list(dict.fromkeys(t.option.candidate for t in fair))[:DOUBTFUL])
         hopeful = [t for t in fair if t.option.candidate in promising][:looks] + self.leaps(fit)
         tried = [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful]
@@ -79,15 +79,19 @@ class Search(Scan):
 
     def leaps(self, fit, most=3):
         """Far values that leave less than a fit at once, as Trials; sought where it leaves much, for no small step leads there."""
+        if not self.leaves_much(fit):
+            return []
         far = [o for o in self.options if not (o.linear or o.candidate.effect.overrides("probes"))
                and o.candidate not in fit.hypothesis.candidates]
-        if fit.chi2.sum() < FAR * self.freedom:
-            return []
         warm = fit.subset(self.scouts)
         tried = [fit.hypothesis.plus(o.candidate, o.directions[0]) for o in far]
         gain = [warm.chi2.sum() - f.chi2.sum() for f in shooting.evaluate(self.scouting, tried, warm)]
         best = [i for i in np.argsort(gain)[::-1][:most] if gain[i] > self.worth(fit) * warm.chi2.sum()]
         return [Trial(far[i], gain[i], 0.0, gain[i], far[i].directions[0], [], range(0), np.zeros(0), warm.chi2.sum()) for i in best]
+
+    def leaves_much(self, fit):
+        """Whether a fit stays far above the noise."""
+        return fit.chi2.sum() > FAR * self.freedom
 
     def choose(self, fit, fits, proposals):
         """The hypothesis that wins, refitted to all windows, as (Fit, added candidates); None when none earns its keep."""
@@ -127,8 +131,9 @@ class Search(Scan):
         while True:
             earlier = {c: self.significance(fit, c) for c in fit.hypothesis.candidates if c not in added}
             worth, level = self.worth(fit), ALPHA / self.places
-            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * worth or p > level] + self.replaced(fit, earlier, added)
-            for candidate in sorted(dict.fromkeys(weak), key=lambda c: earlier[c][1]):
+            weak = [c for c, (p, cost) in earlier.items() if cost < 3 * worth or p > level]
+            weak += self.replaced(fit, [c for c in earlier if c not in weak], added)
+            for candidate in sorted(weak, key=lambda c: earlier[c][1]):
                 less = self.without(fit, candidate)
                 if less.chi2.sum() < (1 + worth * (1 if earlier[candidate][0] < level else 3)) * fit.chi2.sum():
                     fit = less
@@ -140,9 +145,9 @@ class Search(Scan):
         """Which earlier effects the added ones can do without, by refits on few windows: far from here no small step tells."""
         if not added:
             return []
-        small, listed = fit.subset(self.few), list(earlier)
-        fits = shooting.solve(self.small, [fit.hypothesis.minus(c) for c in listed], small, iterations=4)
-        return [c for c, f in zip(listed, fits) if f.chi2.sum() < (1 + self.worth(fit)) * small.chi2.sum()]
+        small = fit.subset(self.few)
+        fits = shooting.solve(self.small, [fit.hypothesis.minus(c) for c in earlier], small, iterations=4)
+        return [c for c, f in zip(earlier, fits) if f.chi2.sum() < (1 + self.worth(fit)) * small.chi2.sum()]
 
     def without(self, fit, candidate):
         """A fit with a candidate left out; what then has to go far away may begin there."""
@@ -277,7 +282,7 @@ class Search(Scan):
                  for f in shooting.evaluate(self.small, hypotheses, small)]
         order = sorted(range(len(looks)), key=looks.__getitem__)[:most]
         order = [i for i in order if same[i] or looks[i] < now + 0.5 * (alone - now)]
-        if fit.chi2.sum() > FAR * self.freedom:  # where no model reaches the noise, related ones may predict as well
+        if self.leaves_much(fit):  # where no model reaches the noise, related ones may predict as well
             order += [i for i in range(len(looks)) if i not in order and hypotheses[i].candidates[-1] in akin]
         hypotheses = [hypotheses[i] for i in order]
         pair = None

@@ -104,6 +104,14 @@ def table(rows, best):
             print("| " + " | ".join(map(str, cells)) + " |")
 
 
+def walking(rows, enough=3000):
+    """After how many of all rounds, over all seeds, Hopper's policy walks on real, per method."""
+    print()
+    for algo, seeds in curves(rows)["Hopper-v4", "deep", "default"].items():
+        rounds = [value for returns in seeds.values() for value in returns[1:]]
+        print(f"Hopper-v4 {algo}: above {enough} after {sum(value > enough for value in rounds)} of {len(rounds)} rounds")
+
+
 def trpo_table(rows):
     """Markdown: TRPO here and sb3-contrib's, median over seeds of the deterministic return."""
     groups = defaultdict(list)
@@ -120,9 +128,9 @@ def settings_table(rows):
     """Markdown: what a frozen policy returns in the grounded simulator under each variant, and the one-step error; seed by seed."""
     print("\n| method | units of R_AT | f_ψ | γ_AT | max KL | std | error of f_ψ | one-step error | return, stochastic | deterministic |")
     print("|---|---|---|---|---|---|---|---|---|---|")
-    variants = {}
+    variants = defaultdict(list)
     for row in rows:
-        variants.setdefault(tuple(row[k] for k in ("method", "norm", "forward_model", "at_gamma", "at_max_kl", "at_std")), []).append(row)
+        variants[tuple(row[k] for k in ("method", "norm", "forward_model", "at_gamma", "at_max_kl", "at_std"))].append(row)
     for told, of_seeds in variants.items():
         shown = [("forward_model_error", ".4f"), ("one_step_error", ".4f"), ("return_stochastic", ".0f"), ("return_deterministic", ".0f")]
         cells = [", ".join(f"{float(row[k]):{digits}}" for row in of_seeds if row[k]) for k, digits in shown]
@@ -137,3 +145,4 @@ if __name__ == "__main__":
         draw_grounding(rows, best)
         draw_transitions(rows, best)
         table(rows, best)
+        walking(rows)
