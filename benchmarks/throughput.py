@@ -12,6 +12,7 @@ to results/throughput.csv. Memory is this process's peak after (a) and (b), less
 
 import argparse
 import csv
+import itertools
 import os
 import resource
 import sys
@@ -81,18 +82,18 @@ class SB3:
         return clock() - began
 
 
-def measure(env_id, args):
+def measure(env_id, num_envs, args):
     """Rates (rounds, 4) in steps/s of physics, ours, sb3 as it comes, sb3 on our environment; and MiB beyond torch."""
     batch = PRESETS[env_id.split("-")[0]].batch_size
-    ours = Ours(env_id, args.num_envs, args.threads)
+    ours = Ours(env_id, num_envs, args.threads)
     clock = {"wall": time.perf_counter, "cpu": time.process_time}[args.clock]
     ours(batch, clock)
-    physics(env_id, args.num_envs, args.threads, batch, clock)
+    physics(env_id, num_envs, args.threads, batch, clock)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - TORCH_MIB
-    others = [SB3(env_id, args.num_envs, args.threads, stock) for stock in (True, False)]
+    others = [SB3(env_id, num_envs, args.threads, stock) for stock in (True, False)]
     rates = []
     for round in range(args.rounds):
-        runs = [(lambda n, clock: physics(env_id, args.num_envs, args.threads, n, clock), args.batches), (ours, args.batches), *((sb3, 1) for sb3 in others)]
+        runs = [(lambda n, clock: physics(env_id, num_envs, args.threads, n, clock), args.batches), (ours, args.batches), *((sb3, 1) for sb3 in others)]
         rates.append([batch * count / run(batch * count, clock) for run, count in runs])
         print(f"{env_id}, round {round + 1}: " + ", ".join(f"{r:.0f}" for r in rates[-1]) + " steps/s", flush=True)
     return np.array(rates), memory
@@ -101,7 +102,7 @@ def measure(env_id, args):
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="+", default=["Hopper-v4", "HalfCheetah-v4"])
-    parser.add_argument("--num-envs", type=int, default=32)
+    parser.add_argument("--num-envs", type=int, nargs="+", default=[Settings.num_envs, 4 * Settings.num_envs])
     parser.add_argument("--threads", type=int, default=0, help="cores to take (default: all)")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--batches", type=int, default=4, help="batches per round of (a) and (b); (c) gets one, being slow")
@@ -111,17 +112,17 @@ def main(argv=None):
     if args.threads:
         torch.set_num_threads(args.threads)
     rows = []
-    for env_id in sorted(args.envs, reverse=True):
+    for env_id, num_envs in itertools.product(sorted(args.envs, reverse=True), args.num_envs):
         load = os.getloadavg()[0]
-        rates, memory = measure(env_id, args)
+        rates, memory = measure(env_id, num_envs, args)
         a, b, stock, batched = np.median(rates, axis=0)
         ratio = lambda i, j: round(float(np.median(rates[:, i] / rates[:, j])), 3)
         rows.append({
-            "env": env_id, "num_envs": args.num_envs, "threads": args.threads or os.cpu_count(), "rounds": args.rounds, "clock": args.clock, "load_before": round(load, 1),
+            "env": env_id, "num_envs": num_envs, "threads": args.threads or os.cpu_count(), "rounds": args.rounds, "clock": args.clock, "load_before": round(load, 1),
             "physics_steps_per_s": round(a), "trpo_steps_per_s": round(b), "sb3_one_env_steps_per_s": round(stock), "sb3_batched_steps_per_s": round(batched),
             "trpo_to_physics": ratio(1, 0), "trpo_to_sb3_one_env": ratio(1, 2), "trpo_to_sb3_batched": ratio(1, 3), "peak_mib_beyond_torch": round(memory),
         })  # fmt: skip
-        print(f"{env_id}: " + ", ".join(f"{k} {v}" for k, v in rows[-1].items() if k != "env"), flush=True)
+        print(f"{env_id}, {num_envs} environments: " + ", ".join(f"{k} {v}" for k, v in rows[-1].items() if k not in ("env", "num_envs")), flush=True)
     args.results.parent.mkdir(parents=True, exist_ok=True)
     with args.results.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")

@@ -67,7 +67,7 @@ def main(argv=None):
     parser.add_argument("--steps", type=int, help="default: 200k for the pendulum, 1M otherwise")
     parser.add_argument("--max-kl", type=float, help="instead of the preset's; the column `implementation` then tells it too")
     parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--num-envs", type=int, default=32)
+    parser.add_argument("--num-envs", type=int, default=Settings.num_envs, help="another number is told by the column `implementation` too")
     parser.add_argument("--threads", type=int, default=0, help="cores for each training (default: all)")
     parser.add_argument("--results", type=Path, default=ROOT / "results" / "trpo.csv")
     args = parser.parse_args(argv)
@@ -78,7 +78,9 @@ def main(argv=None):
             task = name.partition("-")[0]
             steps, config, label = args.steps or STEPS[task], PRESETS[task], implementation
             if args.max_kl:
-                config, label = dataclasses.replace(config, max_kl=args.max_kl), f"{implementation} max_kl={args.max_kl:g}"
+                config, label = dataclasses.replace(config, max_kl=args.max_kl), f"{label} max_kl={args.max_kl:g}"
+            if args.num_envs != Settings.num_envs:
+                label += f" num_envs={args.num_envs}"
             for seed in args.seeds or range(SEEDS[implementation]):
                 key = {"implementation": label, "env": name, "seed": seed, "steps": steps}
                 if finished(args.results, key):
