@@ -23,21 +23,26 @@ CAP = 10.0  # times the largest finite error of a window, that one which blows u
 def earned(search, fit, windows, position_noise):
     """The fit without the effects that are not worth having for predicting, dropped one at a time, the others refitted."""
     noise = evidence.reporting_noise(position_noise)
+    error = lambda settings: gaps(search.world, settings, windows, noise)
     while fit.hypothesis.effects:
         candidates = fit.hypothesis.candidates
-        before, after = (gaps(search.world, s, windows, noise) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
+        before, after = (error(s) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
         far = search.leaves_much(fit)
         rise, bound, _ = scatter(windows, before, after)
-        if not overall(after) > (1 + WORSE) * overall(before) or not far and rise < bound:
+        harm = overall(after) > (1 + WORSE) * overall(before) and (far or rise >= bound)
+        if harm:  # what only stands in for something else goes first
+            weak = [max(candidates, key=lambda c: (c.effect.name == "unknown", search.significance(fit, c)[0]))]
+        else:
             without = absent(search, fit, windows, noise, far) if len(candidates) > 1 else [before]
             doubts = {c: doubt(search, fit, windows, c, after, less) for c, less in zip(candidates, without)}
-            weak = {c: d for c, d in doubts.items() if d is not None}
-            if not weak:
+            weak = sorted((c for c, d in doubts.items() if d is not None), key=doubts.get)
+        for candidate in weak:
+            less = search.without(fit, candidate)  # the others refitted with more care: is the doubt still there?
+            if harm or doubt(search, fit, windows, candidate, after, error([less.hypothesis.settings] * len(windows))) is not None:
                 break
-            gone = min(weak, key=weak.get)
-        else:  # what only stands in for something else goes first
-            gone = max(candidates, key=lambda c: (c.effect.name == "unknown", search.significance(fit, c)[0]))
-        fit = search.without(fit, gone)
+        else:
+            break
+        fit = less
     return fit
 
 
