@@ -16,6 +16,7 @@ from recordings import grouped
 AWAY, PACE = 8, 3  # a spike is so many times as far off as rows usually are, and as the motion before and after goes in a row
 LONGEST = 3  # rows of a spike; what lasts longer may be real
 CATCH_UP = 2  # the change after repeated values, in the one that follows it: above, they were stale
+LEAST = 3  # standard deviations of their number, by which repeats must outnumber those of chance
 COUNTS = 3  # of the encoder: changes up to these are its resolution
 
 
@@ -83,6 +84,8 @@ def _repeats(values):
     count = change[~same].min()
     chance = same.sum() <= 3 * (np.count_nonzero(change[~same] < 1.5 * count) - 1)  # a coarse and noisy sensor repeats, too
     usual = np.median(change[~same])
+    alike = np.count_nonzero(change[~same] < 0.1 * usual) * count / (0.2 * usual)  # rows that noise makes so, with this resolution
+    chance |= same.sum() <= alike + LEAST * np.sqrt(alike + 1)
     begin = np.flatnonzero(same & ~np.append(False, same[:-1]))  # change[k] is between rows k and k + 1
     for first in begin:
         last = first

@@ -36,6 +36,17 @@ def test_sound_recordings_stay(noise, counts):
     assert not rows.any() and notes == []
 
 
+def test_readings_that_are_alike_by_chance_stay():
+    """Among 16000 noisy readings of seven digits two or so are as the row before, and the next is far from them."""
+    time = np.arange(8000) * 0.002
+    motion = 0.4 * np.sin(np.outer(time, [1.0, 1.7]))
+    for seed in range(20):
+        noisy = motion + np.random.default_rng(seed).normal(0, 1e-4, motion.shape)
+        digits = np.vectorize(lambda x: float(f"{x:.7g}"))(noisy)
+        rows, notes = missing(Recording("run.csv", time, digits, np.full_like(digits, np.nan), np.zeros_like(digits)))
+        assert not rows.any() and notes == []
+
+
 def test_rest_and_starting_from_it_stay():
     sound = recorded(0.0)
     rest = np.repeat(sound.qpos[:1], 100, axis=0)
