@@ -7,6 +7,8 @@ Nothing is fitted to them but their own faults, and those only where one explain
 of sensors of motion: forces are the model's own, and where they differ it may be the model that is wrong.
 """
 
+from typing import NamedTuple
+
 import mujoco
 import numpy as np
 
@@ -26,6 +28,18 @@ MOTION = "rad", "rad/s", "rad/s²", "m", "m/s", "m/s²"
 UNITS = {"rad": "JOINTPOS", "rad/s": "JOINTVEL GYRO BALLANGVEL FRAMEANGVEL", "rad/s²": "FRAMEANGACC",
          "m": "TENDONPOS FRAMEPOS RANGEFINDER SUBTREECOM GEOMDIST", "m/s": "TENDONVEL VELOCIMETER FRAMELINVEL SUBTREELINVEL",
          "m/s²": "ACCELEROMETER FRAMELINACC", "N": "TOUCH FORCE", "N·m": "TORQUE", "T": "MAGNETOMETER", "J": "E_POTENTIAL E_KINETIC"}
+
+
+class Tried(NamedTuple):
+    """A sensor's fault at a value, and sums over each of the clusters of windows (C,)."""
+
+    candidate: object
+    value: float
+    gram: np.ndarray  # of the slope of the sensor's reading with the value
+    score: np.ndarray  # of that slope times what is left
+    left: np.ndarray  # squares of what it leaves of the measurements
+    bare: np.ndarray  # squares of what no fault leaves
+    rows: int
 
 
 def recorded(model, recordings):
@@ -115,36 +129,37 @@ def faults(world, settings, train, position_noise, velocity_noise, event=None, m
                 here = np.isfinite(left) & np.isfinite(slope) & np.isfinite(bare) & ~early[..., None]
                 total = lambda x: scores.summed(labels, np.where(here, x, 0.0).sum((1, 2)))
                 gram, score = total(slope**2), total(slope * left)
-                tried[name, effect] = candidates[name], values[name], gram, score, total(left**2), total(bare**2), here.sum()
+                tried[name, effect] = Tried(candidates[name], values[name], gram, score, total(left**2), total(bare**2), here.sum())
                 values[name] = float(np.clip(values[name] + score.sum() / max(gram.sum(), 1e-300), p.low, p.high))
     for name, columns in known:
-        mine = sorted((t for (n, _), t in tried.items() if n == name), key=lambda t: t[4].sum())
-        found = [finding(world, name, *t, len(tried), train) for t in mine]
+        mine = sorted((t for (n, _), t in tried.items() if n == name), key=lambda t: t.left.sum())
+        found = [finding(world.model, t, noise_of(train, name), len(tried)) for t in mine]
         if found[0]:
-            same = [f for f, t in zip(found[1:], mine[1:]) if f and t[4].sum() < (1 + SAME) ** 2 * mine[0][4].sum()]
+            same = [f for f, t in zip(found[1:], mine[1:]) if f and t.left.sum() < (1 + SAME) ** 2 * mine[0].left.sum()]
             rivals = [{"effect": f["effect"], "place": f["place"], "parameters": [{k: p[k] for k in ("name", "nominal", "value", "unit")}
                                                                                   for p in f["parameters"]]} for f in same]
             out.append({**found[0], "also_possible": rivals})
     return out
 
 
-def finding(world, name, candidate, value, gram, score, left, bare, rows, tests, train):
-    """The finding of a sensor's fault from sums over clusters of windows (C,), or None where it is not sure enough."""
-    p = candidate.parameters[0]
-    noise = noise_of(train, name)
-    if len(gram) < 3 or not bare.sum() - left.sum() > EXPLAINED * max(bare.sum() - rows * noise**2, 0.2 * bare.sum()):
+def finding(model, tried, noise, tests):
+    """The finding of a sensor's fault, or None where it is not sure enough. tests: how many faults were tried in all."""
+    name, p, gram = tried.candidate.place.name, tried.candidate.parameters[0], tried.gram
+    left, bare = tried.left.sum(), tried.bare.sum()
+    if len(gram) < 3 or not bare - left > EXPLAINED * max(bare - tried.rows * noise**2, 0.2 * bare):
         return None
-    whole = score + gram * (value - p.nominal)  # as seen from the sound sensor, its slope taken as here
+    whole = tried.score + gram * (tried.value - p.nominal)  # as seen from the sound sensor, its slope taken as here
     move, _, chance, held = scores.wald(gram[:, None, None], whole[:, None])
     if chance * tests > LEVEL or held.sum() <= 0:
         return None
     half = scores.t_quantile(len(gram) - 1) * float(np.sqrt(scores.sandwich(gram[:, None, None], whole[:, None], move)[0, 0]))
-    if value - half <= p.nominal <= value + half:
+    low, high = tried.value - half, tried.value + half
+    if low <= p.nominal <= high:
         return None
-    size = unit(world.model, name) if p.unit == "sensor" else p.unit
-    return {"effect": candidate.effect.name, "place": {"kind": "sensor", "name": name},
-            "parameters": [{"name": p.name, "nominal": float(p.nominal), "value": value, "unit": size,
-                            "low": max(value - half, p.low), "high": min(value + half, p.high)}],
-            "evidence": {"held_out_error_removed": 0.0, "sensor_error_removed": float(1 - np.sqrt(left.sum() / bare.sum())),
+    size = unit(model, name) if p.unit == "sensor" else p.unit
+    return {"effect": tried.candidate.effect.name, "place": {"kind": "sensor", "name": name},
+            "parameters": [{"name": p.name, "nominal": float(p.nominal), "value": tried.value, "unit": size,
+                            "low": max(low, p.low), "high": min(high, p.high)}],
+            "evidence": {"held_out_error_removed": 0.0, "sensor_error_removed": float(1 - np.sqrt(left / bare)),
                          "p_value": min(chance * tests, 1.0)},
             "depends_on": [], "when": None, "written_as": "measurement", "also_possible": []}
