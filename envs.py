@@ -111,7 +111,11 @@ class Change:
     value: float
 
     def of(self, old):
-        return self.value if self.op == "=" else old * self.value
+        """The new value for an old one, floats. Raises EnvError where it is none."""
+        new = self.value if self.op == "=" else float(old) * self.value
+        if not np.isfinite(new):
+            raise EnvError(f"{self.name}:{self.field}*{self.value:g} makes {new} of {old:g}: choose a smaller factor")
+        return new
 
 
 def parse_perturbation(text):

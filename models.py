@@ -225,7 +225,7 @@ class Regressor(nn.Module):
         return self.outputs.inverse(self.net(self.inputs(x)))
 
     def fit(self, x, y, generator, max_updates=5_000, patience=10, batch_size=256, lr=1e-3):
-        """Least squares with Adam, for at most max_updates minibatches; stops earlier when the held-out fifth
+        """Least squares with Adam, for at most max_updates * batch_size samples; stops earlier when the held-out fifth
         has not improved for `patience` epochs.
 
         Args: x (N, n_in), y (N, n_out) float32 tensors; generator: the split and the batches are drawn from it.

@@ -268,7 +268,7 @@ class GAT(Grounding):
         return {"forward_model_error": relative(self.real_model.fit(tau_real, seed), tau_real)}
 
     def update(self, policy, steps, seed, on_update=None):
-        """f_sim^-1 from as many transitions in the sim as the real data holds, but at least `steps` of them."""
+        """f_sim^-1 from as many transitions in the sim as the real data holds, but at most `steps` of them (and whole episodes)."""
         episodes, tau_sim = 0, None
         while tau_sim is None or len(tau_sim) < min(steps, len(self.seen)):
             more = rollouts(policy, self.sim, self.sim.num_envs, seed + episodes)[1]

@@ -92,7 +92,8 @@ class Run:
             done = len(run.progress)
             run.train = [row for row in run._read("train.csv") if int(row["grounding_step"]) < max(done, 1)]
             if (run.folder / "lines.json").exists():
-                run.lines = json.loads((run.folder / "lines.json").read_text())
+                lines = json.loads((run.folder / "lines.json").read_text())
+                run.lines = {"trained on real": float(lines["trained on real"])}
         except FileNotFoundError:
             raise RunError(f"{folder} holds no run (no config.json): name the --out folder of an earlier run") from None
         except (ValueError, KeyError, TypeError, OSError):

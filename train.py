@@ -261,14 +261,14 @@ def pretrained(s, world, env, steps, bar):
         except (ValueError, KeyError, TypeError, RuntimeError):
             raise RunError(f"{path} holds no trained policy of this program: delete it") from None
         return learner.state()
-    name = "pretrain" if world == bar.world else "reference"
-    bar.run.train = [row for row in bar.run.train if row["phase"] != name]  # what a cut-off attempt left
-    log = bar.phase(0, name)
-    learner.learn(env, steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=log)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"cannot make the folder {folder}: {error.strerror}; choose another --pretrained") from None
+    name = "pretrain" if world == bar.world else "reference"
+    bar.run.train = [row for row in bar.run.train if row["phase"] != name]  # what a cut-off attempt left
+    log = bar.phase(0, name)
+    learner.learn(env, steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=log)
     bar.run.flush()
     save_whole(path, learner.state())
     return learner.state()
@@ -305,9 +305,19 @@ def replay(folder):
 def settings_of(folder, saved):
     """The Settings in a run's config.json. Raises RunError where it holds something else."""
     try:
-        return Settings(**saved).completed()
-    except TypeError:
-        raise RunError(f"{folder}/config.json does not hold this program's settings: start a new run") from None
+        s = Settings(**saved).completed()
+        values = [(f, getattr(s, f.name)) for f in dataclasses.fields(Settings)]
+        sound = all(type(v) in ((float, int) if kind_of(f) is float else (kind_of(f),)) and v in f.metadata.get("choices", [v]) for f, v in values)
+    except (TypeError, AttributeError):
+        sound = False
+    if not sound:
+        raise RunError(f"{folder}/config.json does not hold this program's settings: start a new run")
+    return s
+
+
+def kind_of(setting):
+    """int, float or str: what a field of Settings holds."""
+    return {"int": int, "float": float, "str": str}[getattr(setting.type, "__name__", setting.type)]
 
 
 class Parser(argparse.ArgumentParser):
@@ -319,14 +329,17 @@ def parse(argv):
     """The parsed command line: every field of Settings, and what to do with which run. Raises RunError where it makes no sense."""
     parser = Parser(prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for f in dataclasses.fields(Settings):
-        kind = {"int": int, "float": float, "str": str}[getattr(f.type, "__name__", f.type)]
         shown = "" if f.default is None else f" (default: {f.default})"
         extra = {k: v for k, v in f.metadata.items() if k != "help"}
-        parser.add_argument(f"--{f.name.replace('_', '-')}", type=kind, default=f.default, help=f.metadata["help"] + shown, **extra)
+        parser.add_argument(f"--{f.name.replace('_', '-')}", type=kind_of(f), default=f.default, help=f.metadata["help"] + shown, **extra)
     parser.add_argument("--out", help="folder of the run (default: runs/ENV-ALGO-SEED)")
     parser.add_argument("--resume", metavar="RUN", help="continue the run in this folder, with the settings it began with")
     parser.add_argument("--replay", metavar="RUN", help="animate the best policy of this run on sim and real, to RUN/replay.gif")
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default]
+    if given and (args.resume or args.replay):
+        raise RunError(f"--{given[0].replace('_', '-')} cannot be changed: a run goes on with the settings it began with; leave it out")
+    return args
 
 
 def main(argv=None):

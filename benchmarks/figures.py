@@ -52,7 +52,7 @@ def draw_grounding(rows, best):
             mean, se = values.mean(0), values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.zeros(length)
             axes.plot(mean, color=COLORS[algo], lw=2, marker="o", ms=3, label=f"{algo}, {seeds_of(values)}")
             axes.fill_between(range(length), mean - se, mean + se, color=COLORS[algo], alpha=0.2, lw=0)
-        lines = [row for row in best if (row["env"], row["policy"], row["tag"]) == (env, policy, "default") and row["algo"] != "real"]
+        lines = [row for row in best if (row["env"], row["policy"], row["tag"], row["algo"]) == (env, policy, "default", "rgat")]
         for column, color in (("trained_on_real", COLORS["real"]), ("before_grounding", COLORS["sim"])):
             values = [float(v) for v in {row["seed"]: row[column] for row in lines if row[column]}.values()]
             if values:
@@ -82,7 +82,7 @@ def draw_transitions(rows, best):
                 x, y = ([float(r[k]) for r in run] for k in ("real_transitions", "real_return_deterministic"))
                 label = None if i else f"{algo}, {seeds_of(seeds)}"
                 axes.semilogx(x, y, color=COLORS[algo], lw=1, marker="o", ms=4, alpha=0.7, label=label)
-        lines = {r["seed"]: float(r["trained_on_real"]) for r in best if r["env"] == env and r["policy"] == "deep"}
+        lines = {r["seed"]: float(r["trained_on_real"]) for r in best if (r["env"], r["policy"], r["algo"]) == (env, "deep", "rgat")}
         axes.axhline(np.mean(list(lines.values())), color=COLORS["real"], lw=1.2, ls="--", label="trained on real, mean")
         axes.set(title=env, xlabel="real transitions used", ylabel="return on real, deterministic", ylim=(0, None))
         axes.legend(fontsize=7)

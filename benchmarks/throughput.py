@@ -7,12 +7,14 @@
 (c) is sb3-contrib's TRPO with the same settings and batch size: in one environment of gymnasium's, as it comes,
     and in our batched environment through benchmarks/sb3_adapter.py.
 The four alternate for several rounds; medians of the rates and of each round's ratios are printed and written
-to results/throughput.csv. Memory is this process's peak after (a) and (b), less what importing torch took.
+to results/throughput.csv. Each task and number of environments has a process of its own, whose peak after (a) and (b),
+less what importing torch took, is the memory.
 """
 
 import argparse
 import csv
 import itertools
+import multiprocessing
 import os
 import resource
 import sys
@@ -114,7 +116,8 @@ def main(argv=None):
     rows = []
     for env_id, num_envs in itertools.product(sorted(args.envs, reverse=True), args.num_envs):
         load = os.getloadavg()[0]
-        rates, memory = measure(env_id, num_envs, args)
+        with multiprocessing.get_context("spawn").Pool(1) as own:
+            rates, memory = own.apply(measure, (env_id, num_envs, args))
         a, b, stock, batched = np.median(rates, axis=0)
         ratio = lambda i, j: round(float(np.median(rates[:, i] / rates[:, j])), 3)
         rows.append({

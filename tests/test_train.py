@@ -252,6 +252,7 @@ BAD = {
     "field": (["--real", "pole:colour=1"], "colour"),
     "body": (["--real", "torso:mass*1.27"], "pole"),
     "joint": (["--real", "knee:damping=1"], "hinge"),
+    "too heavy": (["--real", "pole:mass*1e308"], "smaller"),
     "negative mass": (["--real", "pole:mass=-1"], "positive"),
     "seed": (["--seed", "-1"], "--seed"),
     "pretrain": (["--pretrain-steps", "-5"], "--pretrain-steps"),
@@ -286,6 +287,8 @@ def test_out_that_cannot_be_used(tmp_path, capfd, finished):
     refused(command(tmp_path / ("x" * 300)), capfd, "--out")
     before = contents(finished("rgat"))
     refused(command(finished("rgat")), capfd, "--resume")
+    refused(["--resume", finished("rgat"), "--grounding-steps", "9"], capfd, "--grounding-steps")
+    refused([*command(tmp_path / "run"), "--pretrained", tmp_path / "file"], capfd, "--pretrained")
     assert contents(finished("rgat")) == before
 
 
@@ -312,6 +315,13 @@ def test_a_disk_that_fills_up_leaves_whole_steps(write, tmp_path, capfd, finishe
     assert_same_run(folder, finished("rgat"))
 
 
+SETTINGS = {
+    "config with a word for a number": ("num_envs", "many"), "config with half a seed": ("seed", 0.5), "config with another algo": ("algo", "sac"),
+    "config with another policy": ("policy", "wide"), "config with a number for a change": ("real", 5),
+}  # fmt: skip
+LINES = {"lines in a list": "[1]", "lines of something else": '{"a": 1}', "line without a number": '{"trained on real": "high"}'}
+
+
 def break_run(folder, how):
     step = folder / "step_02.pt"
     if how == "no run":
@@ -320,10 +330,12 @@ def break_run(folder, how):
         (folder / "config.json").write_text('{"name": "web", "version": 2}')
     elif how == "config with foreign settings":
         (folder / "config.json").write_text('{"settings": {"env": "Hopper-v4", "learning_rate": 0.1}}')
-    elif how == "config with a word for a number":
+    elif how in SETTINGS:
         config = json.loads((folder / "config.json").read_text())
-        config["settings"]["num_envs"] = "many"
+        config["settings"].update([SETTINGS[how]])
         (folder / "config.json").write_text(json.dumps(config))
+    elif how in LINES:
+        (folder / "lines.json").write_text(LINES[how])
     elif how == "config cut short":
         (folder / "config.json").write_text((folder / "config.json").read_text()[:40])
     elif how == "progress without numbers":
@@ -355,10 +367,10 @@ def break_run(folder, how):
 
 
 BROKEN = (
-    "no run,config of something else,config with foreign settings,config with a word for a number,config cut short,table cut short,progress without numbers,checkpoint that is a tensor,"
+    "no run,config of something else,config with foreign settings,config cut short,table cut short,progress without numbers,checkpoint that is a tensor,"
     "checkpoint missing,checkpoint cut short,checkpoint of something else,checkpoint of another robot,checkpoint that is a list,"
     "real data missing,real data broken,policy broken,policy missing"
-).split(",")
+).split(",") + [*SETTINGS, *LINES]
 
 
 @pytest.mark.parametrize("how", BROKEN)
