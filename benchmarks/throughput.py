@@ -86,6 +86,8 @@ class SB3:
 
 def measure(env_id, num_envs, args):
     """Rates (rounds, 4) in steps/s of physics, ours, sb3 as it comes, sb3 on our environment; and MiB beyond torch."""
+    if args.threads:
+        torch.set_num_threads(args.threads)
     batch = PRESETS[env_id.split("-")[0]].batch_size
     ours = Ours(env_id, num_envs, args.threads)
     clock = {"wall": time.perf_counter, "cpu": time.process_time}[args.clock]
@@ -111,8 +113,6 @@ def main(argv=None):
     parser.add_argument("--clock", choices=["wall", "cpu"], default="wall", help="cpu counts this process's own time: for a busy machine, with --threads 1")
     parser.add_argument("--results", type=Path, default=ROOT / "results" / "throughput.csv")
     args = parser.parse_args(argv)
-    if args.threads:
-        torch.set_num_threads(args.threads)
     rows = []
     for env_id, num_envs in itertools.product(sorted(args.envs, reverse=True), args.num_envs):
         load = os.getloadavg()[0]
