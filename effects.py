@@ -188,6 +188,23 @@ def runge_kutta(model):
     return model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
+def displace(spec, kind, name, by):
+    """Move a spec's "body" or "geom" by a vector (3,) in the axes of its body, whatever <frame>s it stands in."""
+    find = lambda within: getattr(within, kind)(name)
+    element, turn = find(spec), np.eye(3)
+    if element.frame is not None:
+        def compiled(move):
+            other = spec.copy()
+            find(other).pos += move
+            return find(other.compile()).pos
+        turn = np.stack([compiled(axis) - compiled(0 * axis) for axis in np.eye(3)])
+    ends = kind == 'geom' and not np.isnan(element.fromto[0])
+    if ends:
+        element.fromto += np.tile(turn @ by, 2)
+    else:
+        element.pos += turn @ by
+
+
 def angle(spec, model, j, value):
     """A position of joint j as the spec writes it."""
     return np.rad2deg(value) if spec.compiler.degree and turns(model, j) else value

@@ -351,7 +351,7 @@ class Backlash(JointEffect):
     def build(self, spec, model, i):
         motor = spec.joint(model.joint(i).name)
         motor.armature = max(motor.armature, 0.01 * self.scale(model, i))
-        load = motor.parent.add_joint(name=f'backlash:{motor.name}', type=motor.type, pos=motor.pos, axis=motor.axis)
+        load = motor.parent.add_joint(name=f'backlash:{motor.name}', type=motor.type, pos=model.jnt_pos[i], axis=model.jnt_axis[i])
         load.armature = load.frictionloss = load.ref = load.springref = load.margin = 0.0
         load.damping, load.stiffness = [0.0] * 3, [0.0] * 3
         load.limited, load.range = mujoco.mjtLimited.mjLIMITED_TRUE, [angle(spec, model, i, x) for x in (-0.5, 0.5)]

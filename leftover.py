@@ -89,8 +89,8 @@ def _variable(model, variable, time, qpos, qvel, qacc, ctrl):
             return (qpos[:, q], joint, length) if kind == "position" else (qvel[:, v], joint, length + "/s")
     if kind == "control":
         actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
-        if actuator >= 0:
-            return ctrl[:, actuator], None, ""
+        if actuator >= 0 and model.actuator_ctrlnum[actuator]:
+            return ctrl[:, model.actuator_ctrladr[actuator]], None, ""
     return None, None, ""
 
 

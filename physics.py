@@ -13,7 +13,7 @@ import numpy as np
 import surroundings  # noqa: F401, I001  (their effects join the catalogue, in this order)
 from joints import JointEffect
 import actuators     # noqa: F401
-from effects import (EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, Place,  # noqa: F401  (EFFECTS to others)
+from effects import (EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, Place, displace,  # noqa: F401  (EFFECTS to others)
                      angle, catalogue, constant_force, turns)
 
 REST, RESTING = 0.02, 0.05  # share of a joint's travel about its end, and of all rows found there, where it seems to lie at its stop
@@ -130,7 +130,7 @@ class LinkLength(Effect):
         model.body_pos[i] *= values[0] / np.linalg.norm(model.body_pos[i])
 
     def write(self, spec, model, i, values):
-        spec.body(model.body(i).name).pos = model.body_pos[i] * values[0] / np.linalg.norm(model.body_pos[i])
+        displace(spec, 'body', model.body(i).name, (values[0] / np.linalg.norm(model.body_pos[i]) - 1) * model.body_pos[i])
         return 'mjcf'
 
 
@@ -203,8 +203,14 @@ class SensorBias(SensorEffect):
     def measure(self, values):
         return values[0], 1.0, 0.0
 
+    @staticmethod
+    def shared(model, i):
+        """Whether a fixed tendon, or an actuator in the parent's frame, reads the joint too: their zeros would move along."""
+        wrapped = (model.wrap_objid == i) & (model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT)
+        return wrapped.any() or ((model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINTINPARENT) & (model.actuator_trnid[:, 0] == i)).any()
+
     def write(self, spec, model, i, values):
-        if self.kind == 'sensor':
+        if self.kind == 'sensor' or self.shared(model, i):
             return 'measurement'
         joint, offset = spec.joint(model.joint(i).name), angle(spec, model, i, values[0])
         joint.ref, joint.springref = joint.ref + offset, joint.springref + offset

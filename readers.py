@@ -96,7 +96,7 @@ def _by_index(model):
     """The same columns with every place by its index, for those who write qpos:0 although the joint has a name."""
     table = {}
     for kind, count, named in (("qpos", model.njnt, model.joint), ("qvel", model.njnt, model.joint),
-                               ("ctrl", model.nu, model.actuator), ("sensor", model.nsensor, model.sensor)):
+                               ("ctrl", model.nactuator, model.actuator), ("sensor", model.nsensor, model.sensor)):
         for i in range(count):
             table[f"{kind}:{i}"] = f"{kind}:{named(i).name or i}"
     return table

@@ -84,10 +84,12 @@ def accepted(recording, model):
 
 
 def _recording(path, name, columns, model, first_row):
-    """Columns to a Recording. Raises RecordingError on time that does not increase, NaN controls, impossible values."""
+    """Columns to a Recording. Raises RecordingError on time that does not increase, NaN controls but in the last row, impossible values."""
     time = columns["time"]
     for column, values in columns.items():
         kind = column.split(":")[0]
+        if kind == "ctrl" and len(values) > 1 and np.isnan(values[-1]):  # it would act after the last row: some loggers leave it out
+            columns[column] = values = np.append(values[:-1], values[-2])
         bad = np.isinf(values) | (np.abs(values) > LARGEST[kind])
         if kind in ("time", "ctrl"):
             bad |= np.isnan(values)

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from effects import Effect, Parameter, catalogue
+from effects import Effect, Parameter, catalogue, displace
 
 FACTORS = 0.25, 0.5, 2.0, 4.0  # of a contact's stiffness or damping, whose effect soon is not in proportion
 
@@ -219,5 +219,5 @@ class GroundHeight(Effect):
         model.geom_pos[i, 2] = values[0]
 
     def write(self, spec, model, i, values):
-        spec.geom(model.geom(i).name).pos[2] = values[0]
+        displace(spec, 'geom', model.geom(i).name, np.array([0.0, 0.0, values[0] - model.geom_pos[i, 2]]))
         return 'mjcf'

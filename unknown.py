@@ -10,6 +10,7 @@ states, the named effects and a constant force are projected out: what is left i
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 import scores
@@ -104,7 +105,8 @@ def controls(model, v, joint):
     """[(variable, (W,) window averages)] of the single controls that act on a joint."""
     return [("control:" + (model.actuator(a).name or str(a)), v.control[:, model.actuator_ctrladr[a]])
             for a in range(model.nactuator if model.nu else 0)
-            if model.actuator_trnid[a, 0] == joint and model.actuator_ctrlnum[a] == 1]
+            if model.actuator_trntype[a] in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+            and model.actuator_trnid[a, 0] == joint and model.actuator_ctrlnum[a] == 1]
 
 
 def bases(world, v, joint):

@@ -210,6 +210,7 @@ def difference_noise(column):
 
     Differences annihilate a smooth motion and keep white noise; a quantile keeps impacts and standstill out. Where
     the estimate still falls with d the noise is not white (filtered before it was stored): then coarser rows count.
+    Of a reading that mostly stands still it is the rounding to its smallest step; inf where it never moves.
     """
     column = column[np.isfinite(column)]
     best = np.inf
@@ -226,6 +227,9 @@ def difference_noise(column):
         best = min(estimates)
         if len(estimates) < 5 or estimates[-1] > 0.6 * estimates[1]:
             break
+    if best == 0:
+        step = np.abs(np.diff(column))
+        best = step[step > 0].min(initial=np.inf) / np.sqrt(12)
     return best
 
 

@@ -131,14 +131,16 @@ def depends_words(depends_on):
 
 def errors(summary):
     """Held-out error (before, after, floor, unit, place), three numbers and two texts: in SI at the channel that the
-    correction betters most, or, where they are the same, which is farthest from a perfect one; or over all channels in
-    multiples of the noise. Infinite: the model blows up."""
+    correction betters most (or worsens most, where it worsens the whole), or, where they are the same, which is farthest from a
+    perfect one; or over all channels in multiples of the noise. Infinite: the model blows up."""
     fit, place, factor = summary["fit"]["held_out"], "", 1
     unit = "times the noise"
     channels = {name: _infinite(c) for name, c in (fit.get("channels") or {}).items() if c["floor"]}
     if channels:
         match = summary["verdict"] == "match"
-        gains = {name: (c["before"] if match else c["before"] - c["after"]) / c["floor"] for name, c in channels.items()}
+        whole = _infinite(fit)
+        sign = -1 if whole["after"] > whole["before"] else 1
+        gains = {name: (c["before"] if match else sign * (c["before"] - c["after"])) / c["floor"] for name, c in channels.items()}
         name = max(gains, key=lambda n: (math.isinf(channels[n]["after"]), np.nan_to_num(gains[n])))
         fit, place = channels[name], " at " + channel_words(name)
         unit, factor = SMALL.get(fit["unit"], (fit["unit"], 1))

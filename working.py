@@ -140,7 +140,7 @@ class Working:
     def activation(self, recording, start):
         """Activations (na,) at time `start`, run on from the recorded control."""
         act, m = np.zeros(self.model.na), self.model
-        for a in range(self.nominal.nactuator):
+        for a in np.flatnonzero(self.nominal.actuator_ctrlnum):
             i, kind = m.actuator_actadr[a], m.actuator_dyntype[a]
             signal = self.signal(recording, a, self.nominal.actuator_ctrladr[a])
             t = np.array([start - signal.delay])

@@ -49,9 +49,11 @@ class World:
                         index = str(element.id)
                         element.name = f'index {index}' if index in taken else index
             self.model = self.spec.compile()
-        self.candidates = []
+        self.candidates, taken = [], {e.name for e in (*self.spec.actuators, *self.spec.joints)}
         for effect in EFFECTS:
             for name in effect.places(self.model):
+                if f'{effect.name}:{name}' in taken:  # this model is a corrected one, which has it already
+                    continue
                 parameters = effect.parameters(self.model, effect.id(self.model, name))
                 self.candidates.append(Candidate(effect, Place(effect.kind, name), tuple(parameters)))
         self._engines = {}
@@ -62,8 +64,9 @@ class World:
         """The World of an MJCF file. ValueError, of one line, if it does not compile."""
         try:
             with quiet():
-                spec = mujoco.MjSpec.from_file(str(path))
-            return cls(spec, Path(path).name)
+                world = cls(mujoco.MjSpec.from_file(str(path)), Path(path).name)
+                mujoco.MjSpec.from_string(world.corrected_xml({})[0]).compile()  # before the work: can it be written as one file?
+            return world
         except ValueError as error:
             raise ValueError(' '.join(str(error).split())) from None
 
@@ -196,16 +199,21 @@ class World:
         for actuator in spec.actuators:  # the history must reach back far enough, whatever the time step became
             if actuator.delay > 0:
                 actuator.nsample = max(actuator.nsample, int(np.ceil(actuator.delay / spec.option.timestep - 1e-9)) + 1)
-        folder = Path(self.spec.modelfiledir).absolute()
-        spec.meshdir, spec.texturedir = str(folder / self.spec.meshdir), str(folder / self.spec.texturedir)
-        spec.compiler.savecompiled = spec.compiler.savecanonical = False
         with quiet():
-            try:
-                spec.compile()
-            except ValueError:  # a fitted inertia that no rigid body has (A + B < C): the nearest that stock MuJoCo takes
-                spec.compiler.balanceinertia = True
-                spec.compile()
-            return spec.to_xml(), written
+            return self._plain(spec), written
+
+    @staticmethod
+    def _plain(spec):
+        """A spec as MJCF, with absolute paths."""
+        folder = Path(spec.modelfiledir).absolute()
+        spec.meshdir, spec.texturedir = str(folder / spec.meshdir), str(folder / spec.texturedir)
+        spec.compiler.savecompiled = spec.compiler.savecanonical = False
+        try:
+            spec.compile()
+        except ValueError:  # a fitted inertia that no rigid body has (A + B < C): the nearest that stock MuJoCo takes
+            spec.compiler.balanceinertia = True
+            spec.compile()
+        return spec.to_xml()
 
 
 class Case:
