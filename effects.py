@@ -206,8 +206,18 @@ def displace(spec, kind, name, by):
 
 
 def angle(spec, model, j, value):
-    """A position of joint j as the spec writes it."""
+    """A position of a new joint like joint j as the spec writes it."""
     return np.rad2deg(value) if spec.compiler.degree and turns(model, j) else value
+
+
+def authored(spec, model, j, value):
+    """A position of joint j as the spec writes it. What was attached from another file keeps that file's units, and stands in a frame."""
+    if not (turns(model, j) and spec.frames):
+        return angle(spec, model, j, value)
+    other, name = spec.copy(), model.joint(j).name
+    joint = other.joint(name)
+    joint.ref, joint.limited = 1.0, mujoco.mjtLimited.mjLIMITED_FALSE  # its range may be half written
+    return value / other.compile().joint(name).qpos0[0]
 
 
 def passive(spec, name, trntype, target, **block):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from effects import (BALL, HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Effect, Parameter, angle, catalogue, constant_force, passive,
+from effects import (BALL, HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Effect, Parameter, angle, authored, catalogue, constant_force, passive,
                      runge_kutta, turns)
 
 # frictionloss as a nearly rigid constraint: with MuJoCo's default a stuck joint creeps
@@ -232,7 +232,7 @@ class SpringOffset(JointEffect):
         joint = spec.joint(model.joint(i).name)
         k = joint.stiffness
         if k[0] > 0 and not k[1] and not k[2]:
-            joint.springref = joint.springref + angle(spec, model, i, values[0] / k[0])
+            joint.springref = joint.springref + authored(spec, model, i, values[0] / k[0])
         else:
             constant_force(spec, f'spring_offset:{joint.name}', values[0], JOINT_TRANSMISSION, joint.name)
         return 'mjcf'
@@ -322,7 +322,7 @@ class JointStop(JointEffect):
     def write(self, spec, model, i, values):
         joint = spec.joint(model.joint(i).name)
         joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-        joint.range = [angle(spec, model, i, x) for x in self._range(values)]
+        joint.range = [authored(spec, model, i, x) for x in self._range(values)]
         return 'mjcf'
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import surroundings  # noqa: F401, I001  (their effects join the catalogue, in this order)
 from joints import JointEffect
 import actuators     # noqa: F401
-from effects import (EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, Place, displace,  # noqa: F401  (EFFECTS to others)
-                     angle, catalogue, constant_force, turns)
+from effects import (EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, Place, authored,  # noqa: F401  (EFFECTS to others)
+                     catalogue, constant_force, displace, turns)
 
 REST, RESTING = 0.02, 0.05  # share of a joint's travel about its end, and of all rows found there, where it seems to lie at its stop
 
@@ -212,7 +212,7 @@ class SensorBias(SensorEffect):
     def write(self, spec, model, i, values):
         if self.kind == 'sensor' or self.shared(model, i):
             return 'measurement'
-        joint, offset = spec.joint(model.joint(i).name), angle(spec, model, i, values[0])
+        joint, offset = spec.joint(model.joint(i).name), authored(spec, model, i, values[0])
         joint.ref, joint.springref = joint.ref + offset, joint.springref + offset
         joint.range = [bound + offset for bound in joint.range]
         for actuator in spec.actuators:  # servos and magnets go on acting on the true position

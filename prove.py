@@ -221,7 +221,8 @@ def compare_parameters(answer, findings, runs):
             match = reported if len(wanted) == 1 else [p for p in reported if p["name"] == name]
             if not match or item["effect"] in VECTORS and _still(answer, index, name, match[0], runs):
                 continue
-            rows.append({"effect": item["effect"], "name": name, "truth": item["parameters"][name],
+            more = match[0]["nominal"] if item["effect"] == "back_emf" else 0.0  # it was hidden beside what a servo has of it
+            rows.append({"effect": item["effect"], "name": name, "truth": item["parameters"][name] + more,
                          **{key: match[0].get(key) for key in ("nominal", "value", "low", "high")}})
     return rows
 

@@ -43,6 +43,21 @@ def test_what_stands_in_frames_is_written_where_it_is_simulated():
     np.testing.assert_allclose(model.joint("backlash:jb").axis, nominal.joint("jb").axis, atol=1e-6)
 
 
+@pytest.mark.parametrize("units", ["degree", "radian"])
+@pytest.mark.parametrize("own", ["degree", "radian"])
+def test_an_attached_robot_keeps_its_own_units(units, own, tmp_path):
+    """Of files in degrees and in radians, one in the other."""
+    turn = {"degree": 90, "radian": np.pi / 2}[own]
+    (tmp_path / "robot.xml").write_text(f"""<mujoco><compiler angle="{own}"/><worldbody><body name="link"><joint name="j" axis="0 1 0"
+        range="{-turn} {turn}" stiffness="1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>""")
+    (tmp_path / "scene.xml").write_text(f"""<mujoco><compiler angle="{units}"/><asset><model name="robot" file="robot.xml"/></asset>
+        <worldbody><attach model="robot" body="link" prefix="x_"/></worldbody></mujoco>""")
+    world = World.load(tmp_path / "scene.xml")
+    np.testing.assert_allclose(corrected(world, "joint_stop", "x_j", -0.3, 0.4)[0].joint("x_j").range, (-0.3, 0.4), atol=1e-6)
+    np.testing.assert_allclose(corrected(world, "spring_offset", "x_j", 0.1)[0].qpos_spring, 0.1, atol=1e-6)
+    np.testing.assert_allclose(corrected(world, "sensor_bias", "x_j", 0.05)[0].qpos0, 0.05, atol=1e-6)
+
+
 def test_a_biased_sensor_whose_joint_a_tendon_reads_is_not_written():
     tendon = FRAMES.replace("<actuator>", '<tendon><fixed name="t"><joint joint="jb" coef="1"/></fixed></tendon><actuator>')
     assert corrected(World(mujoco.MjSpec.from_string(FRAMES)), "sensor_bias", "jb", 0.05)[1] == "mjcf"
