@@ -199,21 +199,16 @@ class World:
         for actuator in spec.actuators:  # the history must reach back far enough, whatever the time step became
             if actuator.delay > 0:
                 actuator.nsample = max(actuator.nsample, int(np.ceil(actuator.delay / spec.option.timestep - 1e-9)) + 1)
-        with quiet():
-            return self._plain(spec), written
-
-    @staticmethod
-    def _plain(spec):
-        """A spec as MJCF, with absolute paths."""
-        folder = Path(spec.modelfiledir).absolute()
-        spec.meshdir, spec.texturedir = str(folder / spec.meshdir), str(folder / spec.texturedir)
+        folder = Path(self.spec.modelfiledir).absolute()
+        spec.meshdir, spec.texturedir = str(folder / self.spec.meshdir), str(folder / self.spec.texturedir)
         spec.compiler.savecompiled = spec.compiler.savecanonical = False
-        try:
-            spec.compile()
-        except ValueError:  # a fitted inertia that no rigid body has (A + B < C): the nearest that stock MuJoCo takes
-            spec.compiler.balanceinertia = True
-            spec.compile()
-        return spec.to_xml()
+        with quiet():
+            try:
+                spec.compile()
+            except ValueError:  # a fitted inertia that no rigid body has (A + B < C): the nearest that stock MuJoCo takes
+                spec.compiler.balanceinertia = True
+                spec.compile()
+            return spec.to_xml(), written
 
 
 class Case:

@@ -105,7 +105,7 @@ def test_noise_of_a_reading_that_stands_still():
     assert difference_noise(steps) == pytest.approx(0.01 / np.sqrt(12))
 
 
-def csv(path, rows, control="0"):
+def csv(path, rows):
     lines = ["time,qpos:j,qpos:k,ctrl:pull"] + [f"{t},{a},{b},{u}" for t, a, b, u in rows]
     path.write_text("\n".join(lines) + "\n")
     return str(path)
