@@ -52,7 +52,7 @@ def diagnose(model, recordings, held_out=None, progress=None):
     notes += _runs(world.model, given)
     if not held:
         train, held = split(train)
-    recorded.check(train, world.model)  # these alone have to say enough
+    recorded.enough(train)
     diagnosis = identify(world, train, held, progress=progress)
     return dataclasses.replace(diagnosis, summary={**diagnosis.summary, "warnings": notes + diagnosis.summary["warnings"]})
 

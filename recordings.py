@@ -165,6 +165,19 @@ def check(recordings, model):
         _check_values(recording, model, warn)
         _check_rates(recording, model, warn)
         _check_overlap(recording, model, warn)
+    moving = enough(recordings)
+    for recording in recordings:
+        if not any(recording is other for other in moving):
+            warn(recording, "nothing moves beyond the sensors' noise; it says little")
+    for recording in moving[:5]:
+        doubt = suspect(recording, model)
+        if doubt:
+            raise RecordingError(f"{recording.name}: {doubt}")
+    return grouped(found)
+
+
+def enough(recordings):
+    """The recordings in which something moves. Raises RecordingError where they are too little, or one is another's copy."""
     moving = [recording for recording in recordings if _moves(recording)]
     everything = recordings[0].name + _more(recordings)
     rows, seconds = sum(len(r.time) for r in moving), sum(r.time[-1] - r.time[0] for r in moving)
@@ -175,14 +188,7 @@ def check(recordings, model):
     if rows < 20 or seconds < 0.6:
         raise RecordingError(f"{everything}: not enough data: {rows} rows over {seconds:.2g} s; at least 20 rows over 0.6 s "
                              f"are needed, and {ENOUGH}")
-    for recording in recordings:
-        if not any(recording is other for other in moving):
-            warn(recording, "nothing moves beyond the sensors' noise; it says little")
-    for recording in moving[:5]:
-        doubt = suspect(recording, model)
-        if doubt:
-            raise RecordingError(f"{recording.name}: {doubt}")
-    return grouped(found)
+    return moving
 
 
 def grouped(found):
