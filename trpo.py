@@ -207,7 +207,7 @@ class TRPO:
 
     def __init__(self, policy, value, config):
         self.policy, self.value, self.config = policy, value, config
-        self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr)
+        self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr, fused=True)
         self.generator = torch.Generator()
 
     def state(self):
