@@ -132,7 +132,7 @@ class Saturation(ActuatorEffect):
 
     def probes(self, model, i, recordings):
         used = self.forces(model, i, recordings).max()
-        return used * np.array([[0.9], [0.7], [0.5], [0.3]]) if used > 0 else np.zeros((0, 1))
+        return used * np.array([[0.9], [0.7], [0.5], [0.3], [0.1]]) if used > 0 else np.zeros((0, 1))
 
     def edit(self, model, i, values):
         model.actuator_forcelimited[i] = True

@@ -132,6 +132,10 @@ class Effect:
         """The parameters with steps and bounds that suit the recorded motion."""
         return parameters
 
+    def possible(self, values):
+        """Whether a real machine can have these values, and not another effect by this name."""
+        return True
+
     def canonical(self, values):
         """The same effect in its usual numbers, where several sets of values mean the same."""
         return values

@@ -12,6 +12,7 @@ from effects import (BALL, HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Effect, Param
 SOLREF_FRICTION = (0.004, 1.0)
 SOLIMP_FRICTION = (0.999, 0.9999, 0.001, 0.5, 2.0)
 STRENGTHS = 1.0, 10.0, 100.0  # of a force that grows faster than in proportion, over what turns the fastest motion round
+FALLS = 0.05  # share by which friction at rest is larger than that of motion, at least, that it is called Stribeck's
 DISSIPATION = ('viscous_damping', 'coulomb_friction', 'quadratic_damping', 'back_emf')
 
 
@@ -183,6 +184,10 @@ class StribeckFriction(JointEffect):
         step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
         slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
         return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
+
+    def possible(self, values):
+        """It falls with speed, by enough to matter."""
+        return values[1] > (1 + FALLS) * values[0]
 
     def edit(self, model, i, values):
         CoulombFriction().edit(model, i, values[1:2])

@@ -41,6 +41,11 @@ class Hypothesis:
     def parameters(self):
         return [p for c, _ in self.effects for p in c.parameters]
 
+    @property
+    def possible(self):
+        """Whether all values are such as a real machine can have, the effects being what they are called."""
+        return all(c.effect.possible(values) for c, values in self.effects)
+
     def moved(self, vector):
         out, at = [], 0
         for c, values in self.effects:

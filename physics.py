@@ -110,6 +110,10 @@ class Inertia(InertialEffect):
         moments = zip(('ixx', 'iyy', 'izz'), model.body_inertia[i])
         return tuple(Parameter(n, 'kg·m²', I, 0.02 * I, 100 * I, 0.02 * I) for n, I in moments)
 
+    def possible(self, values):
+        """No principal moment of a rigid body is larger than the sum of the others."""
+        return 2 * max(values) <= sum(values) * (1 + 1e-6)
+
     def edit(self, model, i, values):
         model.body_inertia[i] = values
 

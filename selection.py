@@ -30,8 +30,9 @@ class Search(Scan):
         for _ in range(most):
             trials, gram, score, chi2 = self.trials(fit, late)
             self.ranking = self.ranking or trials
-            proposals = [p for p in self.proposals(fit, trials, gram, score, chi2) + pairs if frozenset(c for c, _ in p) not in refused]
-            hypotheses = [fit.hypothesis for _ in proposals]
+            ways = [(fit.hypothesis, p) for p in self.proposals(fit, trials, gram, score, chi2) + pairs] + self.swaps(fit)
+            ways = [(rest, p) for rest, p in ways if frozenset(c for c, _ in p) not in refused]
+            hypotheses, proposals = [rest for rest, _ in ways], [p for _, p in ways]
             for i, proposal in enumerate(proposals):
                 for candidate, start in proposal:
                     hypotheses[i] = hypotheses[i].plus(candidate, start)
@@ -77,6 +78,23 @@ class Search(Scan):
         return out + [list(pair) for gain, *pair in self.pairs(trials, gram, score, doubles)
                       if gain > best + max(2 * worth * chi2, 0.1 * best)]
 
+    def swaps(self, fit):
+        """Effects without gradient for which a simpler one may stand: [(the hypothesis without that, [(the other, its best start)]), ...]."""
+        tried = []
+        for candidate in fit.hypothesis.candidates:
+            akin, rest = set(self.world.related(candidate)) - set(fit.hypothesis.candidates), fit.hypothesis.minus(candidate)
+            for o in (o for o in self.options if o.candidate in akin and o.candidate.effect.overrides("probes")):
+                n = o.candidate.effect.amplitudes if same_unit(candidate, o.candidate) else 0
+                for probe in o.directions:  # as large as what it replaces
+                    start = [fit.hypothesis.settings[candidate][0] / probe[0] * x for x in probe[:n]] + list(probe[n:])
+                    tried.append((rest, o.candidate, tuple(start)))
+        begun = shooting.evaluate(self.scouting, [rest.plus(*other) for rest, *other in tried], fit.subset(self.scouts))
+        left, best = [f.chi2.sum() for f in shooting.follow(self.scouting, begun, iterations=2)], {}
+        for i in np.argsort(left):
+            rest, candidate, start = tried[i]
+            best.setdefault((rest, candidate), (rest, [(candidate, start)]))
+        return list(best.values())
+
     def leaps(self, fit, most=3):
         """Far values that leave less than a fit at once, as Trials; sought where it leaves much, for no small step leads there."""
         if not self.leaves_much(fit):
@@ -111,7 +129,7 @@ class Search(Scan):
                 continue
             [new] = shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4)
             needed = worth * sum(len(c.parameters) if c.effect.simplicity > 2 else 1 for c in added)
-            if not solid(new.hypothesis) or 1 - new.chi2.sum() / fit.chi2.sum() < needed or not self.shared(fit, new, worth):
+            if not new.hypothesis.possible or 1 - new.chi2.sum() / fit.chi2.sum() < needed or not self.shared(fit, new, worth):
                 continue
             if max(self.significance(new, c)[0] for c in added) < level:
                 return new, added
@@ -273,9 +291,12 @@ class Search(Scan):
                 hypotheses.append(without.plus(option.candidate, start))
                 same.append(chi2 < now + max(LESS * (alone - now), WORTH * now))
                 seen.add(option.candidate)
-        for option in options:  # of a contact's two geoms one hides the other's part, so that columns say nothing
-            if option.linear and option.candidate.effect is candidate.effect and candidate.place.kind == "geom":
-                hypotheses.append(without.plus(option.candidate, values))
+        for option in options:  # of a contact's two geoms, or a joint's two frictions, one hides the other's part: columns say nothing
+            other, n = option.candidate, len(option.candidate.parameters)
+            twin = other.effect is candidate.effect and candidate.place.kind == "geom"
+            if option.linear and (twin or n == 1 and other in akin and same_unit(candidate, other)):
+                start = np.clip(values[:n], [p.low for p in other.parameters], [p.high for p in other.parameters])
+                hypotheses.append(without.plus(other, start))
                 same.append(False)
         # a first look at full size, where what is alike in a small step may differ, and the other way round
         looks = [shooting.project(self.small, f, np.zeros(f.residual.shape + (0,))).chi2.sum()
@@ -299,14 +320,14 @@ class Search(Scan):
             last = fits.pop()
             pair = last.hypothesis if last.chi2.sum() < (1 - 2 * WORTH) * small.chi2.sum() else None
         best = {}
-        for f in sorted(fits, key=lambda f: f.chi2.sum()):
+        for f in sorted((f for f in fits if f.hypothesis.possible), key=lambda f: f.chi2.sum()):
             best.setdefault(f.hypothesis.candidates[-1], f)
         return [(f, c) for c, f in best.items()], pair
 
 
-def solid(hypothesis):
-    """Whether every inertia is one that a rigid body can have: no principal moment above the sum of the others."""
-    return all(2 * max(values) <= sum(values) * (1 + 1e-6) for c, values in hypothesis.effects if c.effect.name == "inertia")
+def same_unit(one, other):
+    """Whether two candidates' first parameters have the same unit, so that the one's value is a start for the other's."""
+    return one.parameters[0].unit == other.parameters[0].unit
 
 
 def simplicity(candidate):

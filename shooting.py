@@ -21,6 +21,7 @@ STUCK = 0.02  # share of the squared residual that start states found anew have 
 POOR = 4.0  # standard deviations of noise's square by which a window leaves more than the best quarter, that make it poor
 FIRST = 8, 3  # rows that a start is led from; where they are far apart
 LED, LEADS = 4, 2  # iterations each time; steps of the parameters at which it is done
+SHORT = 0.1  # of a parameter's step, below which it turns round
 KEPT = 8  # fits of start states that are remembered
 
 
@@ -159,10 +160,13 @@ def led(problem, fits):
 
 
 def perturbed(hypothesis):
-    """One setting per parameter with that parameter moved by its step, away from a bound; and the moves (k,)."""
+    """One setting per parameter with that parameter moved by its step, as far as its bounds let it, or away; and the moves (k,)."""
     vector, out, moves = hypothesis.vector, [], []
     for i, p in enumerate(hypothesis.parameters):
-        move = p.step if p.low <= vector[i] + p.step <= p.high else -p.step
+        move = p.step
+        if not p.low <= vector[i] + move <= p.high:
+            room = (p.high if p.step > 0 else p.low) - vector[i]
+            move = room if SHORT < abs(room / p.step) < 1 else -p.step
         moved = vector.copy()
         moved[i] += move
         out.append(hypothesis.moved(moved).settings)
@@ -217,22 +221,24 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
             break
         perturbations = [perturbed(current[h].hypothesis) for h in moving]
         slopes = columns(problem, [current[h] for h in moving], [p for p, _ in perturbations])
-        proposals = []
+        proposals = []  # where rows are far apart two each: few windows, stuck or all that tell, may decide
         for h, (_, moves), slope in zip(moving, perturbations, slopes):
-            proposals.append(_propose(current[h], slope, moves, damping[h], problem.far_apart))
+            for robust in (False, True)[:1 + problem.far_apart]:
+                proposals.append((h, *_propose(current[h], slope, moves, damping[h], robust)))
         # new parameters, once with moved and once with kept start states: a window takes the better
         trial = []
-        for h, (vector, step) in zip(moving, proposals):
+        for h, vector, step in proposals:
             fit, moved = current[h], current[h].hypothesis.moved(vector)
             trial += [(moved, *problem.moved(fit.qpos, fit.qvel, step)), (moved, fit.qpos, fit.qvel)]
         residual = problem.residuals([s for t in trial for s in [t[0].settings] * number], np.tile(every, len(trial)),
                                      np.concatenate([t[1] for t in trial]), np.concatenate([t[2] for t in trial]))
         residual = residual.reshape(len(trial), number, -1)
-        still, polish, tried = [], [], []
-        for i, h in enumerate(moving):
+        still, polish, tried = [], [], {}
+        for i, (h, _, _) in enumerate(proposals):
             moved, kept = (Fit(*trial[k], residual[k], current[h].start_jacobian) for k in (2 * i, 2 * i + 1))
-            tried.append(moved.better(kept))
-        for h, fit in zip(moving, led(problem, tried) if iteration < leads else tried):
+            tried.setdefault(h, []).append(moved.better(kept))
+        best = [min(tried[h], key=lambda fit: cost(problem, fit)) for h in moving]
+        for h, fit in zip(moving, led(problem, best) if iteration < leads else best):
             old, new = cost(problem, current[h]), cost(problem, fit)
             if new < old:
                 current[h] = fit

@@ -35,6 +35,10 @@ class Wind(Effect):
     def parameters(self, model, i):
         return tuple(Parameter(n, 'm/s', w, -100.0, 100.0, 0.1) for n, w in zip('xyz', model.opt.wind))
 
+    def far(self, model, i, recordings):
+        """Breezes and gusts along every axis: drag grows with the square of the speed, and small ones say little."""
+        return [tuple(model.opt.wind + speed * axis) for speed in (3.0, -3.0, 10.0, -10.0) for axis in np.eye(3)]
+
     def edit(self, model, i, values):
         model.opt.wind = values
 

@@ -119,11 +119,12 @@ class World:
         return replace(candidate, parameters=candidate.effect.suited(candidate.parameters, self.model, i, recordings))
 
     def related(self, candidate):
-        """Candidates at the same joints in whose wrong nominal values this one may hide."""
+        """Candidates at the same joints in whose wrong values this one may hide, or theirs in its."""
         mine, out = self._joints(candidate.place), []
         for other in self.candidates:
             theirs = self._joints(other.place)
-            if other.effect.name in candidate.effect.related and other.effect.name != candidate.effect.name:
+            akin = other.effect.name in candidate.effect.related or candidate.effect.name in other.effect.related
+            if akin and other.effect.name != candidate.effect.name:
                 if mine is None or theirs is None or mine & theirs:
                     out.append(other)
         return out

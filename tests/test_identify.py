@@ -16,6 +16,7 @@ import selection
 import shooting
 import unknown
 import windows as cut
+from effects import Candidate, Parameter
 from identify import identify, named_instead
 from recordings import Recording
 from world import World
@@ -439,6 +440,72 @@ def test_far_values_are_looked_at_where_a_fit_leaves_much():
     best, *_ = search.leaps(shooting.fit_starts(problem, misfit.Hypothesis()))
     assert best.option.candidate.effect.name == "sensor_scale" and best.start[0] == pytest.approx(0.85, rel=0.01)
     assert not search.leaps(shooting.fit_starts(problem, misfit.Hypothesis().plus(best.option.candidate, (0.85,))))
+
+
+FINE = PENDULUM.replace("0.005", "0.00125").format(damping=0.05, mass=0.5)
+
+
+def rubbed(seed, coulomb, static, velocity, rows=250):
+    """A run of the pendulum by a plain loop of its equation of motion, with friction that falls with speed and holds at rest."""
+    model, rng, h = mujoco.MjModel.from_xml_string(FINE), np.random.default_rng(seed), 0.00125
+    inertia, pull = model.dof_M0[0], 9.81 * model.body_mass[1] * -model.body_ipos[1, 2]
+    time, period, phase = 0.01 * np.arange(rows), rng.uniform(0.6, 1.2, 3), rng.uniform(0, 6, 3)
+    ctrl = (0.4 * np.sin(2 * np.pi * time[:, None] / period + phase)).sum(1)
+    q, v, qpos = rng.uniform(-1, 1), 0.0, np.empty((rows, 1))
+    for t in range(rows):
+        qpos[t] = q
+        for _ in range(8):
+            v += h * (ctrl[t] - pull * np.sin(q) - 0.05 * v) / inertia
+            hold = h * (coulomb + (static - coulomb) * np.exp(-((v / velocity) ** 2))) / inertia
+            v = np.sign(v) * max(abs(v) - hold, 0.0)
+            q += h * v
+    return Recording(f"rub{seed}.csv", time, qpos + 2e-3 * rng.normal(size=qpos.shape), np.full(qpos.shape, np.nan), ctrl[:, None], {})
+
+
+@pytest.mark.parametrize("static, effect, values", [(0.25, "stribeck_friction", [0.1, 0.25, 0.5]), (0.1, "coulomb_friction", [0.1])])
+def test_friction_is_named_by_whether_it_falls_with_speed(static, effect, values):
+    world, runs = World(mujoco.MjSpec.from_string(FINE)), [rubbed(seed, 0.1, static, 0.5) for seed in range(3)]
+    finding = identify(world, runs[:2], runs[2:]).summary["findings"][0]  # the loop holds harder than MuJoCo's friction: a trace of more
+    assert finding["effect"] == effect
+    got = [p["value"] for p in finding["parameters"]]
+    assert got[:2] == pytest.approx(values[:2], rel=0.05) and got[2:] == pytest.approx(values[2:], rel=0.1)
+
+
+VANE = """<mujoco><option timestep="0.004" density="1.2" wind="{wind}"/><worldbody><body><joint name="mast" axis="0 1 0" damping=".001"/>
+  <geom type="box" pos="0 0 -.45" size=".002 .15 .15" mass=".05" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><motor name="drive" joint="mast" forcelimited="{limited}" forcerange="-.02 .02"/></actuator></mujoco>"""
+
+
+def blown(seed, **hidden):
+    """A run of a vane, pushed at from time to time, in stock MuJoCo."""
+    model = mujoco.MjModel.from_xml_string(VANE.format(**{"wind": "0 0 0", "limited": "false", **hidden}))
+    rng, data, qpos = np.random.default_rng(seed), mujoco.MjData(model), np.empty((500, 1))
+    ctrl = np.repeat(rng.uniform(-0.2, 0.2, (20, 1)), 25, 0)
+    data.qpos[:] = rng.uniform(-0.3, 0.3)
+    for t in range(len(qpos)):
+        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
+        mujoco.mj_step(model, data, 3)
+    noisy = qpos + NOISE * rng.normal(size=qpos.shape)
+    return Recording(f"vane{seed}.csv", 0.012 * np.arange(len(qpos)), noisy, np.full(qpos.shape, np.nan), ctrl, {})
+
+
+@pytest.mark.parametrize("hidden, effect, value", [({"wind": "3 0 0"}, "wind", 3.0), ({"limited": "true"}, "saturation", 0.02)])
+def test_what_does_not_act_in_proportion_is_found_at_its_size(hidden, effect, value):
+    world, runs = World(mujoco.MjSpec.from_string(VANE.format(wind="0 0 0", limited="false"))), [blown(seed, **hidden) for seed in range(3)]
+    [finding] = identify(world, runs[:2], runs[2:]).summary["findings"]
+    assert finding["effect"] == effect
+    assert finding["parameters"][0]["value"] == pytest.approx(value, rel=0.02)
+
+
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(1e-3, 1), st.booleans()), min_size=1, max_size=4))
+def test_parameters_are_moved_inside_their_bounds_and_never_hardly(cases):
+    effect = Candidate(SimpleNamespace(name="made up"), None, tuple(Parameter("p", "1", 0.0, -1.0, 1.0, step if up else -step) for _, step, up in cases))
+    vector = np.array([v for v, *_ in cases])
+    settings_, moves = shooting.perturbed(misfit.Hypothesis(((effect, tuple(vector)),)))
+    for i, (p, setting) in enumerate(zip(effect.parameters, settings_)):
+        assert -1 <= setting[effect][i] <= 1
+        assert np.array(setting[effect]) - vector == pytest.approx(np.where(np.arange(len(vector)) == i, moves[i], 0))
+        assert shooting.SHORT * abs(p.step) <= abs(moves[i]) <= abs(p.step)
 
 
 def test_nothing_missing_is_a_match():
