@@ -59,7 +59,7 @@ def draw_grounding(rows, best):
                 axes.axhline(np.mean(values), color=color, lw=1.2, ls="--", label=f"{column.replace('_', ' ')}, mean of {len(values)}")
         axes.set(title=f"{env}, {policy} policy", xlabel="grounding step", ylabel="return on real, deterministic", ylim=(0, None))
         axes.xaxis.get_major_locator().set_params(integer=True)
-        axes.legend(fontsize=7)
+        axes.legend(fontsize=7, ncols=2, loc="lower right")
     figure.savefig(RESULTS / "grounding.png", dpi=110)
 
 
