@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from models import gaussian_entropy, gaussian_kl, gaussian_log_prob, least_squares_step
+from models import adam, gaussian_entropy, gaussian_kl, gaussian_log_prob, least_squares_step
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ class TRPO:
 
     def __init__(self, policy, value, config):
         self.policy, self.value, self.config = policy, value, config
-        self.optimizer = torch.optim.Adam(value.parameters(), lr=config.value_lr, fused=True)
+        self.optimizer = adam(value.net, config.value_lr)
         self.generator = torch.Generator()
 
     def state(self):

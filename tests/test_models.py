@@ -22,6 +22,7 @@ from models import (
     gaussian_entropy,
     gaussian_kl,
     gaussian_log_prob,
+    adam,
     least_squares_step,
     load_checkpoint,
 )
@@ -101,13 +102,15 @@ def test_written_out_derivatives_equal_autograds(seed, widths):
 
 @given(seeds, widths)
 @settings(max_examples=20, deadline=None)
-def test_a_least_squares_step_is_autograds(seed, widths):
+def test_least_squares_steps_are_those_of_autograd_and_adam(seed, widths):
     nets = [small_network(seed, widths)[0] for _ in range(2)]
     x, y = torch.randn(11, widths[0], dtype=torch.float64), torch.randn(11, widths[-1], dtype=torch.float64)
-    ours, theirs = (torch.optim.SGD(net.parameters(), lr=0.1) for net in nets)
-    least_squares_step(nets[0], ours, x, y)
-    torch.nn.functional.mse_loss(nets[1](x), y).backward()
-    theirs.step()
+    ours, theirs = adam(nets[0], 0.1), torch.optim.Adam(nets[1].parameters(), lr=0.1)
+    for _ in range(3):
+        least_squares_step(nets[0], ours, x, y)
+        theirs.zero_grad()
+        torch.nn.functional.mse_loss(nets[1](x), y).backward()
+        theirs.step()
     for a, b in zip(*(net.parameters() for net in nets)):
         torch.testing.assert_close(a, b)
 
