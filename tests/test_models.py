@@ -19,10 +19,10 @@ from models import (
     InverseModel,
     Normalizer,
     Value,
+    adam,
     gaussian_entropy,
     gaussian_kl,
     gaussian_log_prob,
-    adam,
     least_squares_step,
     load_checkpoint,
 )
