@@ -80,6 +80,8 @@ class Search(Scan):
 
     def swaps(self, fit):
         """Effects without gradient for which a simpler one may stand: [(the hypothesis without that, [(the other, its best start)]), ...]."""
+        if fit.chi2.sum() < (1 + WORTH) * self.freedom:  # nothing is left for them to explain
+            return []
         tried = []
         for candidate in fit.hypothesis.candidates:
             akin, rest = set(self.world.related(candidate)) - set(fit.hypothesis.candidates), fit.hypothesis.minus(candidate)
