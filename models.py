@@ -12,7 +12,7 @@ import math
 
 import torch
 from torch import nn
-from torch.nn.utils import parameters_to_vector
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 DEEP, SHALLOW = (64, 64), (4,)  # hidden layers of the paper's two target policies (section IV-B)
 LOG_2PI_E = math.log(2 * math.pi * math.e)
@@ -71,10 +71,7 @@ class MLP(nn.Sequential):
 def adam(net, lr):
     """Adam on all weights of a network as the one vector that they become views of: the same numbers, bit for bit, in fewer calls."""
     weights = nn.Parameter(parameters_to_vector(net.parameters()).detach())
-    at = 0
-    for weight in net.parameters():
-        weight.data = weights.data[at : at + weight.numel()].view_as(weight)
-        at += weight.numel()
+    vector_to_parameters(weights, net.parameters())
     return torch.optim.Adam([weights], lr=lr)
 
 
@@ -82,7 +79,7 @@ def least_squares_step(net, optimizer, x, y):
     """One step of adam(net, ...) on the mean of (net(x) - y)^2."""
     values, [weights] = net.values(x), optimizer.param_groups[0]["params"]
     error = values[-1] - y
-    weights.grad = torch.cat([g.reshape(-1) for g in net.gradient(values, (2 / error.numel()) * error)])
+    weights.grad = parameters_to_vector(net.gradient(values, (2 / error.numel()) * error))
     optimizer.step()
 
 
