@@ -221,7 +221,7 @@ def solve(problem, hypotheses, warm, iterations=6, tolerance=1e-3):
             break
         perturbations = [perturbed(current[h].hypothesis) for h in moving]
         slopes = columns(problem, [current[h] for h in moving], [p for p, _ in perturbations])
-        proposals = []  # where rows are far apart two each: few windows, stuck or all that tell, may decide
+        proposals = []  # two each where rows are far apart: windows far off may be stuck, or be the only ones that tell
         for h, (_, moves), slope in zip(moving, perturbations, slopes):
             for robust in (False, True)[:1 + problem.far_apart]:
                 proposals.append((h, *_propose(current[h], slope, moves, damping[h], robust)))
