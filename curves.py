@@ -3,6 +3,7 @@
     candidate = curve(model, 'elbow', 'velocity:elbow', knots)      # its parameters: the force at each knot
 """
 
+import mujoco
 import numpy as np
 
 from effects import HUGE, JOINT_TRANSMISSION, Candidate, Parameter, Place, constant_force
@@ -13,8 +14,8 @@ class Unknown(JointEffect):
     """A force in the joint that is some curve of one variable: its values at knots, linear between, flat beyond.
 
     variable: 'position:<joint>', 'velocity:<joint>', 'control:<actuator>' or 'time'. factor: None, or what the curve is
-    multiplied by: 'control:<actuator>', or 'velocity:<joint>' for its sign. wave: a sine through two knots, a quarter
-    of its period apart.
+    multiplied by: 'control:<actuator>' for what it is asked for (see asked), or 'velocity:<joint>' for its sign. wave: a sine
+    through two knots, a quarter of its period apart.
     """
     name, kind, simplicity = 'unknown', 'joint', 3
 
@@ -62,8 +63,8 @@ class Unknown(JointEffect):
             x, out = read(self.variable, *state), np.zeros_like(state[1])
             out[:, d] = self.at(x, values)
             if self.factor:
-                y = read(self.factor, *state)
-                out[:, d] *= np.sign(y) if self.factor.startswith('velocity') else y
+                kind, _, name = self.factor.partition(':')
+                out[:, d] *= asked(model, model.actuator(name).id, *state[:3]) if kind == 'control' else np.sign(read(self.factor, *state))
             return out
         return curve
 
@@ -88,6 +89,16 @@ class Unknown(JointEffect):
         field[:] = np.array(field) - fit[1:]
         constant_force(spec, f'unknown:{joint.name}', fit[0], JOINT_TRANSMISSION, joint.name)
         return 'mjcf'
+
+
+def asked(model, a, qpos, qvel, ctrl):
+    """(n,) control of an actuator on a hinge or slide; of a servo, less where it already is: its nominal force over its gain."""
+    u, gain, bias = ctrl[..., model.actuator_ctrladr[a]], model.actuator_gainprm[a, 0], model.actuator_biasprm[a]
+    if model.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_AFFINE or not gain:
+        return u
+    j, gear = model.actuator_trnid[a, 0], model.actuator_gear[a, 0]
+    q, v = qpos[..., model.jnt_qposadr[j]], qvel[..., model.jnt_dofadr[j]]
+    return u + (bias[0] + gear * (bias[1] * q + bias[2] * v)) / gain
 
 
 def curve(model, joint, variable, knots, factor=None, wave=False):

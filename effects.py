@@ -20,6 +20,7 @@ import numpy as np
 
 HINGE, SLIDE, BALL = (int(kind) for kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_BALL))
 JOINT_TRANSMISSION = int(mujoco.mjtTrn.mjTRN_JOINT)
+JOINT_TRANSMISSIONS = JOINT_TRANSMISSION, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 HUGE = 1e6     # upper bound where physics gives none, in units of the effect's own scale
 EFFECTS = []   # the catalogue, one instance of each class; effects are applied in this order
 

@@ -15,6 +15,7 @@ import selection
 import sensors
 import shooting
 import windows as cut
+from effects import JOINT_TRANSMISSIONS
 
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
 NEAR = 0.3  # so near they have to come before they are refitted
@@ -200,7 +201,6 @@ def unit_of(model, channel):
     return "rad"
 
 
-JOINT_TRANSMISSIONS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 # What the force of an effect varies with.
 VARIABLES = {"velocity": ("viscous_damping", "quadratic_damping", "coulomb_friction", "stribeck_friction", "back_emf"),
              "position": ("stiffness", "nonlinear_stiffness", "joint_stop", "backlash", "cogging"),

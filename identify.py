@@ -56,7 +56,7 @@ def identify(world, train, held_out, progress=None):
     position_noise, velocity_noise = noise_of(world, train)
     data = world, train, position_noise, velocity_noise, None
     search, fit, ranking, span = searched(data, say)
-    event = happened(data, fit.hypothesis)
+    event = happened(data, search, fit.hypothesis)
     if event:  # what lasts is searched again where it was not disturbed
         data = world, train, position_noise, velocity_noise, event
         search, fit, ranking, span = searched(data, say)
@@ -270,8 +270,8 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
     return span
 
 
-def happened(data, hypothesis):
-    """What came and went for a while, beside what lasts or instead of it: an Event, if it leaves less; else None."""
+def happened(data, search, hypothesis):
+    """What came and went for a while, beside what lasts or instead of it: an Event, if it leaves less than what lasts can; else None."""
     problem = problem_of(*data, LEFTOVER_SPANS[0], FINAL_STEPS)
     lasting, found = shooting.fit_starts(problem, hypothesis), []
     noise = scan.freedom(problem)
@@ -282,7 +282,17 @@ def happened(data, hypothesis):
         event = events.find(data[0], problem, lasting if h == hypothesis else shooting.fit_starts(problem, h))
         if event and event.left < total - notable:
             found.append(event)
-    return min(found, key=lambda e: e.left) if found else None
+    event = min(found, key=lambda e: e.left) if found else None
+    return None if event and lasts(search, problem, lasting, event) else event
+
+
+def lasts(search, problem, fit, event):
+    """Whether a force that acts whenever the motion is like that, beside what a fit holds, explains as much as an event."""
+    found = unknown.leftover(search, problem, fit, fit.chi2.sum())
+    if not found or "time" in found.variables:
+        return False
+    [new] = shooting.solve(problem, [fit.hypothesis.plus(found.candidate, found.candidate.nominal)], fit)
+    return new.chi2.sum() < (1 + selection.WORTH) * event.left
 
 
 def anything_left(data, search, hypothesis, possible):
@@ -310,7 +320,8 @@ def anything_left(data, search, hypothesis, possible):
     if best is None:
         return hypothesis, None, hint, possible
     found, problem, fit, bare = best
-    curve, named = found.candidate, fit.chi2.sum()
+    curve, named = unknown.tuned(problem, fit, found.candidate), fit.chi2.sum()
+    found = replace(found, candidate=curve)
     [fit] = shooting.solve(problem, [hypothesis.plus(curve, curve.nominal)], fit)
     for gone in [hypothesis.candidates] + [(c,) for c in hypothesis.candidates]:
         shorter = misfit.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in gone))

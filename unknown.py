@@ -10,12 +10,12 @@ states, the named effects and a constant force are projected out: what is left i
 
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 import scores
 import shooting
 import windows as cut
+from effects import JOINT_TRANSMISSIONS
 from scan import WORTH, freedom
 
 LEVEL = 0.002  # false-alarm rate, shared between all joints and variables
@@ -23,6 +23,9 @@ SHARE, NOTABLE = 0.25, 0.05  # of the squared residual above the noise, and of t
 LOUD = 4.0  # squared residual of a window over the usual one
 CLUSTERS = 60  # of windows, at most
 KNOTS = 11  # of the curves that are tried, and of those with every other knot
+TURN, HALVINGS = 0.5, 5  # steps of the frequencies that are tried, in turns over a recording; of that step, for the best
+KNOT = 0.01  # relative fall of the squared residual that a knot more must bring
+TAIL = 0.002  # share of what is recorded, beyond the knots at either end
 QUIET = 1.15  # squared residual over that of noise alone, up to which nothing large can be left
 
 
@@ -42,8 +45,8 @@ def hats(x, knots):
 
 
 def spread_knots(x, number):
-    """Distinct knots at quantiles of x, (k,)."""
-    knots = np.unique(np.quantile(x, np.linspace(0.02, 0.98, number)))
+    """Distinct knots at quantiles of x, (k,), the outer ones where hardly anything lies beyond."""
+    knots = np.unique(np.quantile(x, [TAIL, *np.linspace(0.02, 0.98, number)[1:-1], 1 - TAIL]))
     keep = [0]
     for i in range(1, len(knots)):
         if knots[i] - knots[keep[-1]] > 0.02 * np.ptp(knots):
@@ -57,9 +60,9 @@ class Variables:
     def __init__(self, problem):
         model = problem.model
         known = {id(w.recording): cut.states(model, w.recording) for w in problem.windows}
-        rows = [(known[id(w.recording)], w) for w in problem.windows]
-        self.position = np.array([s[0][w.first:w.last + 1].mean(0) for s, w in rows])
-        step = np.array([cut.difference(model, s[0][w.first], s[0][w.last]) for s, w in rows])
+        states = [(known[id(w.recording)], w) for w in problem.windows]
+        self.position = np.array([s[0][w.first:w.last + 1].mean(0) for s, w in states])
+        step = np.array([cut.difference(model, s[0][w.first], s[0][w.last]) for s, w in states])
         self.time = np.array([0.5 * (w.recording.time[w.first] + w.recording.time[w.last]) for w in problem.windows])
         span = np.array([w.recording.time[w.last] - w.recording.time[w.first] for w in problem.windows])
         self.velocity = step / span[:, None]
@@ -83,8 +86,10 @@ def curves(world, problem, v, joint, few):
     known = [cut.states(model, r) for r in {id(w.recording): w.recording for w in problem.windows}.values()]
     seen = {f"position:{name}": np.concatenate([s[0][:, model.jnt_qposadr[joint]] for s in known]),
             f"velocity:{name}": np.concatenate([s[1][:, model.jnt_dofadr[joint]] for s in known])}
-    seen |= {label: u for label, u in controls(model, v, joint)}
+    seen |= {control(model, a): v.control[:, model.actuator_ctrladr[a]] for a in drives(model, joint)}
     out = [world.curve(name, label, knots) for label, x in seen.items() if len(knots := spread_knots(x, KNOTS)) > 2]
+    knots = np.linspace(v.time.min(), v.time.max(), 4)
+    out += [world.curve(name, "time", knots, factor=control(model, a)) for a in drives(model, joint)]
     here = v.position[few, model.jnt_qposadr[joint]]
     if few.any() and np.ptp(here) < 0.3 * np.ptp(v.position[:, model.jnt_qposadr[joint]]):
         knots = spread_knots(here, KNOTS // 2)
@@ -94,39 +99,42 @@ def curves(world, problem, v, joint, few):
 
 
 def coarser(world, curve):
-    """(a curve, weights (k, n) of its n knots' forces in the given curve's k) of the curve itself and of one with every other knot."""
+    """(a curve, weights (k, n) of its n knots' forces in the given curve's k) of the curve itself, of one with every other knot,
+    and of those with a bend at one of them."""
     knots, effect = np.array(curve.effect.knots), curve.effect
-    some = np.unique([*knots[::2], knots[-1]])
-    less = world.curve(curve.place.name, effect.variable, some, effect.factor)
-    return [(curve, np.eye(len(knots)))] + ([(less, hats(knots, some))] if len(some) > 2 else [])
+    fewer = [np.unique([*knots[::2], knots[-1]])] + [knots[[0, k, -1]] for k in range(1, len(knots) - 1)]
+    less = {tuple(some): world.curve(curve.place.name, effect.variable, some, effect.factor) for some in fewer if 2 < len(some) < len(knots)}
+    return [(curve, np.eye(len(knots)))] + [(other, hats(knots, some)) for some, other in less.items()]
 
 
-def controls(model, v, joint):
-    """[(variable, (W,) window averages)] of the single controls that act on a joint."""
-    return [("control:" + (model.actuator(a).name or str(a)), v.control[:, model.actuator_ctrladr[a]])
-            for a in range(model.nactuator if model.nu else 0)
-            if model.actuator_trntype[a] in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+def drives(model, joint):
+    """Ids of the actuators of one control that act on a joint."""
+    return [a for a in range(model.nactuator if model.nu else 0)
+            if model.actuator_trntype[a] in JOINT_TRANSMISSIONS
             and model.actuator_trnid[a, 0] == joint and model.actuator_ctrlnum[a] == 1]
 
 
+def control(model, a):
+    return "control:" + (model.actuator(a).name or str(a))
+
+
 def bases(world, v, joint):
-    """[(variables, basis (W, k), candidate)] of what else to try for a force in a joint, by windows."""
+    """[(basis (W, k), candidate)] of what else to try for a force in a joint, by windows."""
     model, name, out = world.model, cut.joint_name(world.model, joint), []
     q, d = v.position[:, model.jnt_qposadr[joint]], v.velocity[:, model.jnt_dofadr[joint]]
-    here, moving = f"position:{name}", f"velocity:{name}"
     knots = spread_knots(q, 6)
     if len(knots) > 2:
-        out.append(((here, moving), hats(q, knots) * np.sign(d)[:, None], world.curve(name, here, knots, factor=moving)))
-    knots = np.linspace(v.time.min(), v.time.max(), 4)
-    for label, u in controls(model, v, joint):
-        out.append((("time", label), hats(v.time, knots) * u[:, None], world.curve(name, "time", knots, factor=label)))
+        out.append((hats(q, knots) * np.sign(d)[:, None], world.curve(name, f"position:{name}", knots, factor=f"velocity:{name}")))
     knots = np.linspace(v.time.min(), v.time.max(), 7)
-    out.append((("time",), hats(v.time, knots), world.curve(name, "time", knots)))
-    length = np.ptp(v.time)
-    for hertz in np.arange(1.0, 0.7 * length / v.span, 0.5) / length:
-        phase = 2 * np.pi * hertz * v.time
-        out.append((("time",), np.stack([np.cos(phase), np.sin(phase)], 1), world.curve(name, "time", (0.0, 0.25 / hertz), wave=True)))
-    return out
+    out.append((hats(v.time, knots), world.curve(name, "time", knots)))
+    turns = np.ptp(v.time)
+    return out + waves(world, v, name, np.arange(1.0, 0.7 * turns / v.span, TURN) / turns)
+
+
+def waves(world, v, name, hertz):
+    """As bases, for sines of time of some frequencies (n,)."""
+    phases = 2 * np.pi * hertz[:, None] * v.time
+    return [(np.stack([np.cos(phase), np.sin(phase)], 1), world.curve(name, "time", (0.0, 0.25 / f), wave=True)) for f, phase in zip(hertz, phases)]
 
 
 def quiet(problem, fit):
@@ -154,33 +162,69 @@ def leftover(search, problem, fit, bare):
             tried += [{**nominal, curve: tuple(row)} for row in steps]
         where.append(mine)
     scan = shooting.project(problem, fit, shooting.columns(problem, [fit], [own + tried])[0])
-    labels, out, tests = scores.clusters(problem.windows, CLUSTERS), [], 0
-    for i, (c, mine) in enumerate(zip(pushes, where)):
-        column = len(own) + i
-        if scan.gram[:, column, column].sum() < shooting.UNSEEN:
-            continue
-        base = [*range(len(own)), column]
-        options = [(tuple(filter(None, (curve.effect.variable, curve.effect.factor))), mixed(scan, base, columns, weights), curve)
-                   for finest, columns in mine for curve, weights in coarser(world, finest)]
-        options += [(variables, spread(scan, base, column, basis), curve)
-                    for variables, basis, curve in bases(world, v, model.joint(c.place.name).id)]
-        tests += len(options)
-        for variables, (gram, score), curve in options:
-            gram, score = search.freed(scores.summed(labels, gram), scores.summed(labels, score), len(base))
+    labels, out, tests, base = scores.clusters(problem.windows, CLUSTERS), [], 0, {}
+
+    def judged(joint, options):
+        """[(worth, gain, p-value, gain in unseen clusters, joint, candidate)] of options (gram, score, candidate)."""
+        for gram, score, curve in options:
+            gram, score = search.freed(scores.summed(labels, gram), scores.summed(labels, score), len(base[joint]))
             seen = np.einsum("ckk->k", gram) > shooting.UNSEEN
             seen[0] &= bool(curve.effect.factor or curve.effect.wave)  # hats sum to a constant, which is projected out
             if seen.any():
                 _, gain, p, held = scores.wald(gram[:, seen][:, :, seen], score[:, seen])
-                worth = gain - 2 * seen.sum() * chi2 / max(problem.rows, 1)
-                out.append((worth, gain, p, held.sum(), c.place.name, variables, curve))
+                yield gain - 2 * seen.sum() * chi2 / max(problem.rows, 1), gain, p, held.sum(), joint, curve
+
+    for i, (c, mine) in enumerate(zip(pushes, where)):
+        joint, column = c.place.name, len(own) + i
+        if scan.gram[:, column, column].sum() < shooting.UNSEEN:
+            continue
+        base[joint] = [*range(len(own)), column]
+        options = [(*mixed(scan, base[joint], columns, weights), curve) for finest, columns in mine for curve, weights in coarser(world, finest)]
+        options += [(*spread(scan, base[joint], basis), curve) for basis, curve in bases(world, v, model.joint(joint).id)]
+        tests += len(options)
+        out += judged(joint, options)
     good = [o for o in out if o[2] * tests < LEVEL and o[3] > 0]
     if not good:
         return None
     best = max(good, key=lambda o: o[0])
-    simple = [o for o in good if len(o[5]) == 1 and o[0] > 0.85 * best[0]]
-    _, gain, p, _, joint, variables, curve = max(simple, key=lambda o: o[0]) if simple else best
+    simple = [o for o in good if not o[5].effect.factor and o[0] > 0.85 * best[0]]
+    best = max(simple, key=lambda o: o[0]) if simple else best
+    _, gain, p, _, joint, curve = best
     large = gain > max(SHARE * (chi2 - free), WORTH * chi2, NOTABLE * (bare - free))
-    return Leftover(joint, variables, curve, min(1.0, p * tests), float(gain / chi2), bool(large))
+    return Leftover(joint, tuple(filter(None, (curve.effect.variable, curve.effect.factor))), curve, min(1.0, p * tests), float(gain / chi2), bool(large))
+
+
+def finer(problem, v, joint, curve, few):
+    """Curves of the same dependence with more knots: everywhere, or on one side of the bend."""
+    world, effect = problem.world, curve.effect
+    every = [c for finest in curves(world, problem, v, joint, few) for c, _ in coarser(world, finest)]
+    more = [c for c in every if (c.effect.variable, c.effect.factor) == (effect.variable, effect.factor) and len(c.parameters) > len(curve.parameters)]
+    if len(effect.knots) == 3:
+        low, bend, high = effect.knots
+        sides = [low, *np.linspace(bend, high, 4)], [*np.linspace(low, bend, 4), high]
+        more += [world.curve(curve.place.name, effect.variable, side, effect.factor) for side in sides]
+    return more
+
+
+def tuned(problem, fit, curve):
+    """The same dependence with as many knots as pay, or, of a wave, with the frequency that leaves least, beside what a fit holds."""
+    v, joint, leaves = Variables(problem), problem.model.joint(curve.place.name).id, lambda f: f.chi2.sum()
+
+    def solved(tried):
+        return shooting.solve(problem, [fit.hypothesis.plus(c, c.nominal) for c in tried], fit, iterations=3)
+
+    if not curve.effect.wave:
+        tried = [curve, *finer(problem, v, joint, curve, loud(fit, problem))]
+        left = [leaves(f) * (1 + KNOT * len(c.parameters)) for f, c in zip(solved(tried), tried)]
+        return tried[int(np.argmin(left))]
+    hertz, reach = 0.25 / curve.effect.knots[1], TURN / np.ptp(v.time)
+    centres = [hertz, abs(1 / v.span - hertz), 1 / v.span + hertz]  # which windows cannot tell apart
+    for _ in range(HALVINGS):
+        near = [f for centre in centres for f in centre + reach * np.linspace(-1, 1, 5) if f > 0]
+        tried = [c for _, c in waves(problem.world, v, curve.place.name, np.array(near))]
+        best = int(np.argmin([leaves(f) for f in solved(tried)]))
+        curve, centres, reach = tried[best], [near[best]], reach / 2
+    return curve
 
 
 def mixed(scan, base, columns, weights):
@@ -190,9 +234,9 @@ def mixed(scan, base, columns, weights):
     return mix.T @ scan.gram[:, pick][:, :, pick] @ mix, scan.score[:, pick] @ mix
 
 
-def spread(scan, base, column, basis):
-    """Per window: gram and score of basis (W, k) times one column, behind the columns of base."""
-    b, k = len(base), basis.shape[1]
+def spread(scan, base, basis):
+    """Per window: gram and score of basis (W, k) times the last column of base, behind the columns of base."""
+    column, b, k = base[-1], len(base), basis.shape[1]
     gram = np.zeros((len(basis), b + k, b + k))
     gram[:, :b, :b] = scan.gram[:, base][:, :, base]
     gram[:, :b, b:] = scan.gram[:, base, column][:, :, None] * basis[:, None, :]

@@ -546,6 +546,55 @@ def test_what_no_catalogue_knows_is_called_unknown():
     assert end == pytest.approx(max(r.qpos.max() for r in diagnosis.train), abs=0.05)
 
 
+SERVO = PENDULUM.format(damping=0.05, mass=0.5).replace('<motor name="drive" joint="pivot"/>', '<position name="drive" joint="pivot" kp="20" kv="0.6"/>')
+
+
+def tired(name, seed, rows=400):
+    """A run of the pendulum under a servo that loses half of its force within seconds, in stock MuJoCo; position with noise."""
+    model, rng = mujoco.MjModel.from_xml_string(SERVO), np.random.default_rng(seed)
+    data, gain, bias = mujoco.MjData(model), model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
+    time, period, phase = 0.01 * np.arange(rows), rng.uniform(0.6, 1.2, 3), rng.uniform(0, 6, 3)
+    ctrl, qpos = (0.3 * np.sin(2 * np.pi * time[:, None] / period + phase)).sum(1, keepdims=True), np.empty((rows, 1))
+    for t in range(rows):
+        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
+        left = 1 - 0.5 * (1 - np.exp(-time[t]))
+        model.actuator_gainprm[:], model.actuator_biasprm[:] = left * gain, left * bias
+        mujoco.mj_step(model, data, 2)
+    return Recording(name, time, qpos + NOISE * rng.normal(size=qpos.shape), np.full(qpos.shape, np.nan), ctrl, {})
+
+
+def test_a_servo_that_tires_is_no_weaker_servo():
+    world, runs = World(mujoco.MjSpec.from_string(SERVO)), [tired(f"run{seed}.csv", seed) for seed in range(3)]
+    summary = identify(world, runs[:2], runs[2:]).summary
+    [finding] = summary["findings"]
+    assert finding["effect"] == "unknown" and finding["place"]["name"] == "pivot"
+    assert finding["depends_on"] == ["time", "control:drive"]
+    force = [p["value"] for p in finding["parameters"]]
+    left = 1 - 0.5 * (1 - np.exp(-np.array([p["at"] for p in finding["parameters"]])))
+    assert force == pytest.approx(20 * (left - 1), abs=1.0)
+    assert summary["fit"]["held_out"]["after"] < 1.1 * summary["fit"]["held_out"]["floor"]
+
+
+@pytest.mark.parametrize("speed, drag", [(3.0, 1.5), (3.5, 0.2)])
+def test_what_acts_at_high_speed_alone_is_found_and_no_event(speed, drag):
+    """Few windows are so fast; and an event in them would explain it too, but the motion does as well."""
+    summary = diagnosed(push=lambda time, q, v: -drag * max(v - speed, 0)).summary
+    [finding] = summary["findings"]
+    assert finding["effect"] == "unknown" and finding["depends_on"] == ["velocity:pivot"]
+    assert summary["fit"]["held_out"]["after"] < summary["fit"]["held_out"]["before"]
+
+
+@pytest.mark.parametrize("hertz", [1.374, 2.2])
+def test_a_periodic_force_is_found_with_its_frequency(hertz):
+    """Whatever the windows: in those of 0.3 s, 1.374 Hz looks like 1.96 Hz."""
+    diagnosis = diagnosed(push=lambda time, q, v: 0.1 * np.sin(2 * np.pi * hertz * time))
+    [finding] = diagnosis.summary["findings"]
+    assert finding["effect"] == "unknown" and finding["depends_on"] == ["time"] and finding["curve"]["wave"]
+    begin, quarter = [p["at"] for p in finding["parameters"]]
+    assert 0.25 / (quarter - begin) == pytest.approx(hertz, abs=0.02)
+    assert np.hypot(*[p["value"] for p in finding["parameters"]]) == pytest.approx(0.1, rel=0.1)
+
+
 @given(st.integers(0, 10**6))
 @settings(max_examples=60, deadline=None)
 def test_a_region_holds_all_of_the_force_or_is_not_told(seed):

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, strategies as st
 from plants import MODELS, SIZES, START, arm, pendulum, record, simulate, stock
 
+from curves import asked
 from physics import EFFECTS
 from world import Window, World
 
@@ -144,6 +145,18 @@ def test_unknown_curves():
         np.testing.assert_allclose(stock(xml, world, recording, [0.3], [0.5], 60), qpos[k], atol=2e-3)
     assert world.corrected_xml({curve: tuple(np.sin(3 * knots))})[1] == {curve: 'none'}
     assert curve == world.curve('j', 'velocity:j', list(knots)) != world.curve('j', 'velocity:j', knots + 1)
+
+
+def test_what_actuators_are_asked_is_their_force_over_their_gain():
+    for kind in ('motors', 'servos'):
+        model = arm(kind)[0].model
+        data, rng = mujoco.MjData(model), np.random.default_rng(0)
+        for _ in range(5):
+            data.qpos, data.qvel, data.ctrl = rng.normal(size=model.nq), rng.normal(size=model.nv), rng.uniform(-0.1, 0.1, model.nu)
+            model.actuator_forcelimited[:] = 0
+            mujoco.mj_forward(model, data)
+            for a in range(model.nu):
+                assert asked(model, a, data.qpos, data.qvel, data.ctrl) * model.actuator_gainprm[a, 0] == pytest.approx(data.actuator_force[a])
 
 
 def test_probes_show_something(case):
