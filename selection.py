@@ -10,6 +10,7 @@ scores.wald), when clusters that its value was not fitted to gain too, and when 
 
 import numpy as np
 
+import misfit
 import scores
 import shooting
 from scan import WORTH, Scan, Trial
@@ -18,6 +19,7 @@ ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 # in squared residual: of a parameter; of an effect one level less simple; up to which few windows do not decide between two
 PRICE, ODDS, DOUBT = 2.0, 2.0, 8.0
 FAR = 2.0  # squared residual over the noise's
+SHARE = 0.05  # of what several effects explain together, that one in their place may leave
 LESS = 0.03  # share of an effect, from whose absence that of the whole is extrapolated
 DOUBTFUL = 3  # candidates that are refitted for their gain alone, where much is left
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
@@ -183,7 +185,7 @@ class Search(Scan):
 
         Returns (fit, {candidate: [(error ratio, candidate, values), ...]}): what else is possible, best first.
         """
-        possible = {}
+        fit, possible = fit if but else self.united(fit), {}
         for candidate in fit.hypothesis.candidates:
             if candidate in but:
                 continue
@@ -214,6 +216,27 @@ class Search(Scan):
             listed = [(ratio(f), c, f.hypothesis.settings[c]) for f, c in others]
             possible[candidate] = sorted(listed, key=lambda o: (round(o[0], 2), simplicity(o[1])))
         return fit, possible
+
+    def united(self, fit, most=3):
+        """The fit, or one with a single effect where several of one joint together only looked like it, and what else then is needed."""
+        for place in dict.fromkeys(c.place for c in fit.hypothesis.candidates if c.place.kind == "joint"):
+            several = [c for c in fit.hypothesis.candidates if c.place == place]
+            if len(several) < 2:
+                continue
+            rest, small = misfit.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in several)), fit.subset(self.few)
+            tried = [rest.plus(o.candidate, o.directions[0]) for o in self.options if o.candidate.place == place and o.candidate not in several]
+            looks, start = shooting.evaluate(self.scouting, tried, fit.subset(self.scouts)), {}
+            for look in sorted(looks, key=lambda f: f.chi2.sum()):
+                start.setdefault(look.hypothesis.candidates[-1], look.hypothesis)
+            best = sorted(shooting.solve(self.scouting, list(start.values()), fit.subset(self.scouts), iterations=3), key=lambda f: f.chi2.sum())
+            bare, *fits = shooting.solve(self.small, [rest] + [f.hypothesis for f in best[:most]], small, iterations=4)
+            one = min((f for f in fits if f.hypothesis.possible), key=lambda f: f.chi2.sum(), default=bare)
+            if one.chi2.sum() < small.chi2.sum() + SHARE * (bare.chi2.sum() - small.chi2.sum()):
+                [new] = shooting.solve(self.problem, [one.hypothesis], fit, iterations=4)
+                new = self.run(new)
+                if new.chi2.sum() < (1 + WORTH) * fit.chi2.sum():
+                    fit = new
+        return fit
 
     def likeliest(self, fit, rivals, most=3):
         """The likeliest of rivals [(Fit on few windows, candidate)] of equally many parameters, refitted to all windows."""

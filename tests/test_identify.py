@@ -584,6 +584,18 @@ def test_what_acts_at_high_speed_alone_is_found_and_no_event(speed, drag):
     assert summary["fit"]["held_out"]["after"] < summary["fit"]["held_out"]["before"]
 
 
+@pytest.mark.parametrize("push, names", [(lambda time, q, v: -0.8 * q**3, {"nonlinear_stiffness"}),
+                                         (lambda time, q, v: -0.8 * q + 0.15, {"stiffness", "spring_offset"})])
+def test_several_effects_of_a_joint_give_way_to_one_that_does_as_well(push, names):
+    world, runs = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5))), [recorded(f"run{i}.csv", i, push=push) for i in range(2)]
+    problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.3)], np.array([NOISE]), np.array([np.inf]))
+    search, hypothesis = selection.Search(world, problem, runs), misfit.Hypothesis()
+    for name, values in (("stiffness", (1.0,)), ("spring_offset", (0.1,))):
+        hypothesis = hypothesis.plus(world.candidate(name, "pivot"), values)
+    [fit] = shooting.solve(problem, [hypothesis], shooting.fit_starts(problem, misfit.Hypothesis()))
+    assert {c.effect.name for c in search.united(fit).hypothesis.candidates} == names
+
+
 @pytest.mark.parametrize("hertz", [1.374, 2.2])
 def test_a_periodic_force_is_found_with_its_frequency(hertz):
     """Whatever the windows: in those of 0.3 s, 1.374 Hz looks like 1.96 Hz."""
