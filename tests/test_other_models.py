@@ -11,7 +11,7 @@ import diagnose
 import recordings
 import windows as cut
 from leftover import _variable
-from unknown import controls
+from unknown import drives
 from windows import difference_noise
 from world import World
 
@@ -84,11 +84,10 @@ def test_a_corrected_model_can_be_diagnosed_again(tmp_path):
     assert np.isfinite(qpos[:, :10]).all()
 
 
-def test_controls_are_those_that_act_on_the_joint():
+def test_drives_are_the_actuators_of_a_joint():
     """A tendon's number is not a joint's."""
-    world = World(mujoco.MjSpec.from_string(PENDULUM))
-    view = type("View", (), {"control": np.zeros((4, 1))})
-    assert controls(world.model, view, 0) == [] and controls(world.model, view, 1) == []
+    model = mujoco.MjModel.from_xml_string(PENDULUM.replace("<actuator>", '<actuator><position name="servo" joint="k"/>'))
+    assert drives(model, 0) == [] and drives(model, 1) == [0]
 
 
 def test_controls_of_actuators_after_a_passive_one():
