@@ -279,7 +279,8 @@ def _curve(curve, parameters):
     if curve["factor"]:
         kind, _, name = curve["factor"].partition(":")
         label = f"force × sign ({curve['unit']})" if kind == "velocity" else f"force ({curve['unit']}) per control"
-        note = f"Acts times the {'sign of the ' if kind == 'velocity' else ''}{kind} of {name}."
+        note = f"Acts times the {'sign of the ' if kind == 'velocity' else ''}{kind} of {name}"
+        note += " (of a servo: less what it has reached, which is its nominal force over its gain)." if kind == "control" else "."
     return (_box(chart([*lines, Series(x, force, "corrected")], wording.axis_words(curve["variable"]), label,
                        label="the unknown force")) + (f'<p class="note">{E(note)}</p>' if note else ""))
 

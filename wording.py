@@ -63,9 +63,12 @@ def finding_words(finding):
     """One finding in a sentence: "joint elbow: Coulomb friction 0.121 ± 0.004 N·m was left out"."""
     place, effect = place_words(finding["place"]), effect_words(finding["effect"])
     if finding["effect"] == "unknown":
-        on = depends_words(finding.get("depends_on"))
-        return (f"{place}: a force that the catalogue has no name for{f', depending on {on}' if on else ''}"
-                + when_words(finding.get("when")))
+        on, unnamed = depends_words(finding.get("depends_on")), f"{place}: a force that the catalogue has no name for"
+        if (finding.get("curve") or {}).get("wave"):  # its parameters are a sine's values a quarter of a period apart
+            one, other = finding["parameters"]
+            hertz, amplitude = 0.25 / (other["at"] - one["at"]), math.hypot(one["value"], other["value"])
+            return f"{unnamed}, repeating {number(hertz)} times a second with an amplitude of {number(amplitude)} {one['unit']}"
+        return unnamed + (f", depending on {on}" if on else "") + when_words(finding.get("when"))
     parameters, ends = finding["parameters"], ""
     absent = [p for p in parameters if no_stop(p["name"], p["value"]) and no_stop(p["name"], p["nominal"])]
     if absent and len(absent) < len(parameters):  # a stop on one side only

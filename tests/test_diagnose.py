@@ -272,6 +272,13 @@ def test_findings_in_words(given, words):
     assert wording.finding_words(given) == words
 
 
+def test_a_wave_in_words():
+    parameters = [{"name": f"force {k}", "value": v, "unit": "N·m", "at": at} for k, (v, at) in enumerate([(0.3, 0.0), (-0.4, 0.125)])]
+    wave = {**finding("unknown", "joint", "elbow", depends_on=["time"]), "parameters": parameters, "curve": {"wave": True}}
+    assert wording.finding_words(wave) == ("joint elbow: a force that the catalogue has no name for, "
+                                           "repeating 2.00 times a second with an amplitude of 0.500 N·m")
+
+
 def test_error_in_words():
     fit = {"before": 31, "after": 2, "floor": 1, "horizon_s": 0.3,
            "channels": {"qpos:a": {"before": 0.002, "after": 0.002, "floor": 0.001, "unit": "rad"},
