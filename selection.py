@@ -64,9 +64,7 @@ class Search(Scan):
         if self.leaves_much(fit):  # a few windows whose start states stuck may scatter more than the others gain
             promising |= set(list(dict.fromkeys(t.option.candidate for t in fair))[:DOUBTFUL])
         hopeful = [t for t in fair if t.option.candidate in promising][:looks] + self.leaps(fit)
-        tried = [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful]
-        begun = shooting.evaluate(self.scouting, tried, fit.subset(self.scouts))
-        left = [f.chi2.sum() for f in shooting.follow(self.scouting, begun, iterations=2)]
+        left = self.left(fit, [fit.hypothesis.plus(t.option.candidate, t.start) for t in hopeful])
         chosen, by_size = [], sorted(range(len(left)), key=left.__getitem__)
         for i in (i for both in zip(by_size, range(len(left))) for i in both):  # the linear estimate moves the others along
             rivals = [j for j in chosen if self.alike(hopeful[i], hopeful[j], gram) and left[i] > 0.9 * left[j]]
@@ -92,12 +90,16 @@ class Search(Scan):
                 for probe in o.directions:  # as large as what it replaces
                     start = [fit.hypothesis.settings[candidate][0] / probe[0] * x for x in probe[:n]] + list(probe[n:])
                     tried.append((rest, o.candidate, tuple(start)))
-        begun = shooting.evaluate(self.scouting, [rest.plus(*other) for rest, *other in tried], fit.subset(self.scouts))
-        left, best = [f.chi2.sum() for f in shooting.follow(self.scouting, begun, iterations=2)], {}
-        for i in np.argsort(left):
+        best = {}
+        for i in np.argsort(self.left(fit, [rest.plus(*other) for rest, *other in tried])):
             rest, candidate, start = tried[i]
             best.setdefault((rest, candidate), (rest, [(candidate, start)]))
         return list(best.values())
+
+    def left(self, fit, hypotheses):
+        """What hypotheses leave of the scouts as they stand, start states following: [squared residual]."""
+        begun = shooting.evaluate(self.scouting, hypotheses, fit.subset(self.scouts))
+        return [f.chi2.sum() for f in shooting.follow(self.scouting, begun, iterations=2)]
 
     def leaps(self, fit, most=3):
         """Far values that leave less than a fit at once, as Trials; sought where it leaves much, for no small step leads there."""
@@ -225,9 +227,9 @@ class Search(Scan):
                 continue
             rest, small = misfit.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in several)), fit.subset(self.few)
             tried = [rest.plus(o.candidate, o.directions[0]) for o in self.options if o.candidate.place == place and o.candidate not in several]
-            looks, start = shooting.evaluate(self.scouting, tried, fit.subset(self.scouts)), {}
-            for look in sorted(looks, key=lambda f: f.chi2.sum()):
-                start.setdefault(look.hypothesis.candidates[-1], look.hypothesis)
+            start = {}
+            for i in np.argsort(self.left(fit, tried)):
+                start.setdefault(tried[i].candidates[-1], tried[i])
             best = sorted(shooting.solve(self.scouting, list(start.values()), fit.subset(self.scouts), iterations=3), key=lambda f: f.chi2.sum())
             bare, *fits = shooting.solve(self.small, [rest] + [f.hypothesis for f in best[:most]], small, iterations=4)
             one = min((f for f in fits if f.hypothesis.possible), key=lambda f: f.chi2.sum(), default=bare)
