@@ -180,6 +180,12 @@ class StribeckFriction(JointEffect):
                 Parameter('static', force, 0.0, 0.0, HUGE * M, 0.05 * M),
                 Parameter('velocity', self.unit(model, i, 'rad/s', 'm/s'), 0.1, 1e-4, 100.0, 0.01))
 
+    def suited(self, parameters, model, i, recordings):
+        """It has fallen at the speeds that are reached: what still falls there is another law of friction."""
+        coulomb, static, velocity = parameters
+        _, speed = self.travel(model, i, recordings)
+        return coulomb, static, replace(velocity, high=max(velocity.nominal, np.quantile(speed, 0.5) + 1e-4, 0.5 * np.quantile(speed, 0.98)))
+
     def probes(self, model, i, recordings):
         step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
         slow = np.quantile(speed, [0.2, 0.5]) + 1e-4

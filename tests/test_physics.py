@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from plants import MODELS, SIZES, START, arm, pendulum, record, simulate, stock
+from plants import MODELS, SIZES, START, T, arm, pendulum, record, simulate, stock
 
 from curves import asked
 from physics import EFFECTS
@@ -170,6 +170,16 @@ def test_probes_show_something(case):
         assert rows.ndim == 2 and rows.shape[1] == len(low) and len(rows), candidate
         assert (((rows >= low) & (rows <= high)) | np.isinf(rows)).all(), candidate
         assert not (rows == candidate.nominal).all(axis=1).any()
+
+
+def test_stribeck_friction_has_fallen_at_the_speeds_that_are_reached():
+    world, _ = arm('motors')
+    run = record(world)
+    run.qpos = np.cumsum(np.random.default_rng(0).uniform(0, 0.02, (T, world.model.nq)), 0)  # at up to 2 rad/s
+    candidate = world.candidate('stribeck_friction', 'elbow')
+    velocity = world.suited(candidate, [run]).parameters[2]
+    assert 0.5 < velocity.high < 1.5 and velocity.low < velocity.nominal <= velocity.high
+    assert all(row[2] <= velocity.high for row in world.probes(candidate, [run]))
 
 
 @given(st.floats(0.01, 30), st.floats(0.01, 30))
