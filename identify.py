@@ -324,7 +324,7 @@ def anything_left(data, search, hypothesis, possible):
     found = replace(found, candidate=curve)
     [fit] = shooting.solve(problem, [hypothesis.plus(curve, curve.nominal)], fit)
     for gone in [hypothesis.candidates] + [(c,) for c in hypothesis.candidates]:
-        shorter = misfit.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in gone))
+        shorter = fit.hypothesis.minus(*gone)
         if len(shorter.effects) < len(fit.hypothesis.effects):
             shorter = shorter.plus(curve, curve.nominal)
             [less] = shooting.solve(problem, [shorter], bare if len(shorter.effects) == 1 else fit)

@@ -7,7 +7,7 @@ For pictures and for plausibility checks; the diagnosis itself never differentia
 import mujoco
 import numpy as np
 
-from effects import HINGE, SLIDE
+from effects import HINGE, JOINT_TRANSMISSION, SLIDE
 
 HALF = 0.03  # s: half width of the parabolas that smooth the positions
 
@@ -101,6 +101,6 @@ def _joint_of(model, place, joint):
         return own if own >= 0 else None
     if place["kind"] == "actuator":
         actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, place["name"])
-        if actuator >= 0 and model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
+        if actuator >= 0 and model.actuator_trntype[actuator] == JOINT_TRANSMISSION:
             return int(model.actuator_trnid[actuator, 0])
     return joint

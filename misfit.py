@@ -57,8 +57,8 @@ class Hypothesis:
         kept = tuple(e for e in self.effects if e[0] != candidate)
         return Hypothesis(kept + ((candidate, tuple(float(v) for v in values)),))
 
-    def minus(self, candidate):
-        return Hypothesis(tuple(e for e in self.effects if e[0] != candidate))
+    def minus(self, *candidates):
+        return Hypothesis(tuple(e for e in self.effects if e[0] not in candidates))
 
 
 @dataclass

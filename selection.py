@@ -10,7 +10,6 @@ scores.wald), when clusters that its value was not fitted to gain too, and when 
 
 import numpy as np
 
-import misfit
 import scores
 import shooting
 from scan import WORTH, Scan, Trial
@@ -225,7 +224,7 @@ class Search(Scan):
             several = [c for c in fit.hypothesis.candidates if c.place == place]
             if len(several) < 2:
                 continue
-            rest, small = misfit.Hypothesis(tuple(e for e in fit.hypothesis.effects if e[0] not in several)), fit.subset(self.few)
+            rest, small = fit.hypothesis.minus(*several), fit.subset(self.few)
             tried = [rest.plus(o.candidate, o.directions[0]) for o in self.options if o.candidate.place == place and o.candidate not in several]
             start = {}
             for i in np.argsort(self.left(fit, tried)):

@@ -31,12 +31,24 @@ QUIET = 1.15  # squared residual over that of noise alone, up to which nothing l
 
 @dataclass
 class Leftover:
-    joint: str
-    variables: tuple  # e.g. ("velocity:elbow",)
     candidate: object  # the `unknown` effect that models it
     p_value: float
     share: float  # of the squared residual explained
     large: bool  # worth a finding of its own
+
+    @property
+    def joint(self):
+        return self.candidate.place.name
+
+    @property
+    def variables(self):
+        """What it depends on: ("velocity:elbow",), or two."""
+        return dependence(self.candidate)
+
+
+def dependence(curve):
+    """What a curve depends on: its variable, and its factor if it has one."""
+    return tuple(filter(None, (curve.effect.variable, curve.effect.factor)))
 
 
 def hats(x, knots):
@@ -60,9 +72,9 @@ class Variables:
     def __init__(self, problem):
         model = problem.model
         known = {id(w.recording): cut.states(model, w.recording) for w in problem.windows}
-        states = [(known[id(w.recording)], w) for w in problem.windows]
-        self.position = np.array([s[0][w.first:w.last + 1].mean(0) for s, w in states])
-        step = np.array([cut.difference(model, s[0][w.first], s[0][w.last]) for s, w in states])
+        rows = [(known[id(w.recording)], w) for w in problem.windows]
+        self.position = np.array([s[0][w.first:w.last + 1].mean(0) for s, w in rows])
+        step = np.array([cut.difference(model, s[0][w.first], s[0][w.last]) for s, w in rows])
         self.time = np.array([0.5 * (w.recording.time[w.first] + w.recording.time[w.last]) for w in problem.windows])
         span = np.array([w.recording.time[w.last] - w.recording.time[w.first] for w in problem.windows])
         self.velocity = step / span[:, None]
@@ -162,43 +174,38 @@ def leftover(search, problem, fit, bare):
             tried += [{**nominal, curve: tuple(row)} for row in steps]
         where.append(mine)
     scan = shooting.project(problem, fit, shooting.columns(problem, [fit], [own + tried])[0])
-    labels, out, tests, base = scores.clusters(problem.windows, CLUSTERS), [], 0, {}
-
-    def judged(joint, options):
-        """[(worth, gain, p-value, gain in unseen clusters, joint, candidate)] of options (gram, score, candidate)."""
+    labels, out, tests = scores.clusters(problem.windows, CLUSTERS), [], 0
+    for i, (c, mine) in enumerate(zip(pushes, where)):
+        column = len(own) + i
+        if scan.gram[:, column, column].sum() < shooting.UNSEEN:
+            continue
+        base = [*range(len(own)), column]
+        options = [(*mixed(scan, base, columns, weights), curve) for finest, columns in mine for curve, weights in coarser(world, finest)]
+        options += [(*spread(scan, base, basis), curve) for basis, curve in bases(world, v, model.joint(c.place.name).id)]
+        tests += len(options)
         for gram, score, curve in options:
-            gram, score = search.freed(scores.summed(labels, gram), scores.summed(labels, score), len(base[joint]))
+            gram, score = search.freed(scores.summed(labels, gram), scores.summed(labels, score), len(base))
             seen = np.einsum("ckk->k", gram) > shooting.UNSEEN
             seen[0] &= bool(curve.effect.factor or curve.effect.wave)  # hats sum to a constant, which is projected out
             if seen.any():
                 _, gain, p, held = scores.wald(gram[:, seen][:, :, seen], score[:, seen])
-                yield gain - 2 * seen.sum() * chi2 / max(problem.rows, 1), gain, p, held.sum(), joint, curve
-
-    for i, (c, mine) in enumerate(zip(pushes, where)):
-        joint, column = c.place.name, len(own) + i
-        if scan.gram[:, column, column].sum() < shooting.UNSEEN:
-            continue
-        base[joint] = [*range(len(own)), column]
-        options = [(*mixed(scan, base[joint], columns, weights), curve) for finest, columns in mine for curve, weights in coarser(world, finest)]
-        options += [(*spread(scan, base[joint], basis), curve) for basis, curve in bases(world, v, model.joint(joint).id)]
-        tests += len(options)
-        out += judged(joint, options)
+                worth = gain - 2 * seen.sum() * chi2 / max(problem.rows, 1)
+                out.append((worth, gain, p, held.sum(), curve))
     good = [o for o in out if o[2] * tests < LEVEL and o[3] > 0]
     if not good:
         return None
     best = max(good, key=lambda o: o[0])
-    simple = [o for o in good if not o[5].effect.factor and o[0] > 0.85 * best[0]]
-    best = max(simple, key=lambda o: o[0]) if simple else best
-    _, gain, p, _, joint, curve = best
+    simple = [o for o in good if not o[4].effect.factor and o[0] > 0.85 * best[0]]
+    _, gain, p, _, curve = max(simple, key=lambda o: o[0]) if simple else best
     large = gain > max(SHARE * (chi2 - free), WORTH * chi2, NOTABLE * (bare - free))
-    return Leftover(joint, tuple(filter(None, (curve.effect.variable, curve.effect.factor))), curve, min(1.0, p * tests), float(gain / chi2), bool(large))
+    return Leftover(curve, min(1.0, p * tests), float(gain / chi2), bool(large))
 
 
 def finer(problem, v, joint, curve, few):
     """Curves of the same dependence with more knots: everywhere, or on one side of the bend."""
     world, effect = problem.world, curve.effect
     every = [c for finest in curves(world, problem, v, joint, few) for c, _ in coarser(world, finest)]
-    more = [c for c in every if (c.effect.variable, c.effect.factor) == (effect.variable, effect.factor) and len(c.parameters) > len(curve.parameters)]
+    more = [c for c in every if dependence(c) == dependence(curve) and len(c.parameters) > len(curve.parameters)]
     if len(effect.knots) == 3:
         low, bend, high = effect.knots
         sides = [low, *np.linspace(bend, high, 4)], [*np.linspace(low, bend, 4), high]
