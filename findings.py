@@ -41,23 +41,30 @@ def intervals(search, fit):
     if not fit.hypothesis.effects:
         return {}
     slope, moves = search.slopes(fit)
-    scan = shooting.project(search.problem, fit, slope, search.pieces)
+    halved = fit.residual - search.problem.refined(fit).residual  # change of the prediction with half the time step
+    scan = shooting.project(search.problem, fit, np.concatenate([slope, halved[..., None]], -1), search.pieces)
     gram, score = scores.summed(search.labels, scan.gram), scores.summed(search.labels, scan.score)
-    seen = np.diag(gram.sum(0)) > shooting.UNSEEN
-    covariance = scores.sandwich(gram[:, seen][:, :, seen], score[:, seen], np.zeros(seen.sum()))
-    half = np.full(len(moves), np.inf)
-    half[seen] = scores.t_quantile(max(len(gram) - seen.sum(), 1)) * np.sqrt(np.diag(covariance)) * np.abs(moves[seen])
-    # the integrator's own error: as far as the values would move with ever smaller steps, twice as far as with half a step
-    finer = search.problem.refined(fit)
-    shift = np.zeros(len(moves))
-    shift[seen] = 2 * moves[seen] * scores.solve_small(gram.sum(0)[np.ix_(seen, seen)], shooting.project(
-        search.problem, finer, slope, search.pieces).score.sum(0)[seen] - score.sum(0)[seen])
+    seen = np.flatnonzero(np.diag(gram.sum(0))[:-1] > shooting.UNSEEN)
+    half, shift = np.full(len(moves), np.inf), np.zeros(len(moves))
+    half[seen] = np.abs(moves[seen]) * spread(gram, score, seen, np.zeros(len(seen)))  # at the optimum scores are leftovers
+    # as far as ever smaller steps would move the values, which is twice as far as half a step, if so much of it is in the data
+    every = np.append(seen, -1)
+    amounts = scores.solve_small(gram.sum(0)[np.ix_(every, every)], score.sum(0)[every])
+    most = amounts[-1] + spread(gram, score, every, amounts)[-1]
+    shift[seen] = -moves[seen] * scores.solve_small(gram.sum(0)[np.ix_(seen, seen)], gram.sum(0)[seen, -1])
+    shift *= np.clip(most, 0.0, 2.0)
     below, above = half - np.minimum(shift, 0), half + np.maximum(shift, 0)
     out, at = {}, 0
     for c, values in fit.hypothesis.effects:
         out[c] = [(max(v - a, p.low), min(v + b, p.high)) for v, a, b, p in zip(values, below[at:], above[at:], c.parameters)]
         at += len(values)
     return out
+
+
+def spread(gram, score, columns, values):
+    """(k,) half widths of the 95 % intervals of some columns' values, from cluster sums of all columns."""
+    covariance = scores.sandwich(gram[:, columns][:, :, columns], score[:, columns], values)
+    return scores.t_quantile(max(len(gram) - len(columns), 1)) * np.sqrt(np.diag(covariance))
 
 
 def place_of(candidate):

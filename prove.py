@@ -347,7 +347,7 @@ def main():
         folder = Path(arguments.folder)
         folder.mkdir(parents=True, exist_ok=True)
         trial = conceal(arguments.seed, arguments.trial, folder)
-        print("python diagnose.py", *trial.command, "--out report\n" + trial.answer)
+        print(f"cd {folder} && python {ROOT / 'diagnose.py'}", *trial.command, "--out report\n" + trial.answer)
     else:
         import proof_page
         proof_page.write(read(arguments.table), arguments.out)

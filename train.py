@@ -332,7 +332,7 @@ def parse(argv):
         shown = "" if f.default is None else f" (default: {f.default})"
         extra = {k: v for k, v in f.metadata.items() if k != "help"}
         parser.add_argument(f"--{f.name.replace('_', '-')}", type=kind_of(f), default=f.default, help=f.metadata["help"] + shown, **extra)
-    parser.add_argument("--out", help="folder of the run (default: runs/ENV-ALGO-SEED)")
+    parser.add_argument("--out", help="folder of the run (default: runs/ENV-ALGO-sSEED)")
     parser.add_argument("--resume", metavar="RUN", help="continue the run in this folder, with the settings it began with")
     parser.add_argument("--replay", metavar="RUN", help="animate the best policy of this run on sim and real, to RUN/replay.gif")
     args = parser.parse_args(argv)

@@ -1,11 +1,11 @@
-"""Time a diagnosis against mujoco.sysid fitting a fixed list of candidates all at once, on 30 s of a two-joint arm.
+"""Time a diagnosis of 30 s of a two-joint arm, against mujoco.sysid fitting a fixed list of candidates all at once, and of Hopper.
 
     python benchmarks/diagnose.py [--seconds 30]        # -> results/diagnose.csv
 
-Hidden: Coulomb friction in the elbow. sysid is told the candidates (mass, armature, damping, frictionloss: eight
+Hidden in the arm: Coulomb friction in the elbow. sysid is told the candidates (mass, armature, damping, frictionloss: eight
 parameters), true start velocities and one-second sequences; the diagnosis is told nothing. mujoco.sysid needs extra
-packages (requirements-extras.txt); without them only the diagnosis is timed. Seconds are those of the clock, and of all
-threads together.
+packages (requirements-extras.txt); without them only the diagnosis is timed. Hidden in Hopper: a torso 27 % heavier, in
+falls of 1.5 s each. Seconds are those of the clock, and of all threads together.
 """
 
 import argparse
@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from diagnose import diagnose  # noqa: E402
+from envs import model_path  # noqa: E402
 from files import write_table  # noqa: E402
 from recordings import Recording  # noqa: E402
 
@@ -29,22 +30,37 @@ ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><default><g
 <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".025" mass=".6"/></body></body></worldbody>
 <actuator><motor name="a" joint="shoulder"/><motor name="b" joint="elbow"/></actuator>
 <sensor><jointpos name="shoulder_pos" joint="shoulder"/><jointpos name="elbow_pos" joint="elbow"/></sensor></mujoco>"""
-NOISE, FRICTION, INTERVAL = 5e-4, 0.1, 0.01
+NOISE, FRICTION, HEAVIER = 5e-4, 0.1, 1.27
+FALL = 1.5  # s
 
 
-def run(seconds, seed):
-    """(Recording, true qvel) of the arm with Coulomb friction in the elbow, driven by sines."""
-    rng, spec = np.random.default_rng(seed), mujoco.MjSpec.from_string(ARM)
+def arm(seconds, seed):
+    """(Recording, true qvel) of the arm with Coulomb friction in the elbow."""
+    spec = mujoco.MjSpec.from_string(ARM)
     elbow = spec.joint("elbow")
     elbow.frictionloss, elbow.solref_friction[:], elbow.solimp_friction[:3] = FRICTION, [0.004, 1], [0.999, 0.9999, 0.001]
-    model = spec.compile()
-    data, rows = mujoco.MjData(model), round(seconds / INTERVAL)
-    clock = INTERVAL * np.arange(rows)
-    ctrl = (np.array([[1.0, 0.4]]) * np.sin(2 * np.pi * clock[:, None, None] * rng.uniform(0.2, 1.5, (3, 2)) + rng.uniform(0, 6, (3, 2))).sum(1))
-    qpos, qvel = np.empty((rows, 2)), np.empty((rows, 2))
+    return run(spec.compile(), seconds, seed, 0.01, [1.0, 0.4])
+
+
+def hopper(seconds, seed):
+    """(Recording, true qvel) of a fall of Hopper with a heavy torso."""
+    model = mujoco.MjModel.from_xml_path(str(model_path("Hopper-v4")))
+    torso = model.body("torso").id
+    model.body_mass[torso] *= HEAVIER
+    model.body_inertia[torso] *= HEAVIER
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return run(model, seconds, seed, 0.008, [0.2, 0.2, 0.2])
+
+
+def run(model, seconds, seed, interval, strength):
+    """(Recording of noisy positions, true qvel) of a model driven by sines of some strength (nu,)."""
+    rng, data, rows = np.random.default_rng(seed), mujoco.MjData(model), round(seconds / interval)
+    clock, tones = interval * np.arange(rows), (3, model.nu)
+    ctrl = np.array([strength]) * np.sin(2 * np.pi * clock[:, None, None] * rng.uniform(0.2, 1.5, tones) + rng.uniform(0, 6, tones)).sum(1)
+    qpos, qvel = np.empty((rows, model.nq)), np.empty((rows, model.nv))
     for t in range(rows):
         qpos[t], qvel[t], data.ctrl[:] = data.qpos, data.qvel, ctrl[t]
-        mujoco.mj_step(model, data, round(INTERVAL / model.opt.timestep))
+        mujoco.mj_step(model, data, round(interval / model.opt.timestep))
     return Recording(f"run{seed}.csv", clock, qpos + NOISE * rng.normal(size=qpos.shape), np.full_like(qvel, np.nan), ctrl, {}), qvel
 
 
@@ -79,33 +95,48 @@ def with_sysid(recording, qvel, chunk=100):
     return {name: float(found[name].value[0]) for name in found.keys()}
 
 
+def spent():
+    """Seconds of the clock and of the processor, so far."""
+    return np.array([time.monotonic(), time.process_time()])
+
+
+def times(took):
+    return dict(zip(("seconds", "cpu_seconds"), took.round(1).tolist()))
+
+
+def diagnosed(system, model, train, held_out):
+    """Rows of what a diagnosis finds."""
+    begun = spent()
+    found = diagnose(model, train, held_out).summary["findings"]
+    took = spent() - begun
+    return [{"system": system, "method": "diagnose", "parameter": f"{p['name']} {f['place']['name']}", **{k: p[k] for k in ("value", "low", "high")},
+             **times(took)} for f in found for p in f["parameters"]]
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=30.0, help="of recorded motion, in all")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "diagnose.csv")
     options = parser.parse_args()
-    train, qvel = run(0.7 * options.seconds, 0)
-    held, _ = run(0.3 * options.seconds, 1)
-    rows, begun = [], np.array([time.monotonic(), time.process_time()])
-    for finding in diagnose(mujoco.MjSpec.from_string(ARM), [train], [held]).summary["findings"]:
-        for p in finding["parameters"]:
-            rows.append({"method": "diagnose", "parameter": f"{p['name']} {finding['place']['name']}", "value": p["value"], "low": p["low"], "high": p["high"]})
-    now = np.array([time.monotonic(), time.process_time()])
-    spent = {"diagnose": now - begun}
+    train, qvel = arm(0.7 * options.seconds, 0)
+    falls = [hopper(FALL, i)[0] for i in range(round(options.seconds / FALL))]
+    number = round(0.7 * len(falls))
+    rows = diagnosed("two-joint arm", mujoco.MjSpec.from_string(ARM), [train], [arm(0.3 * options.seconds, 1)[0]])
+    begun = spent()
     try:
         found = with_sysid(train, qvel)
     except Exception as error:  # an optional package of changing interface: its failure is a result, not ours
         found = None
         print(f"mujoco.sysid failed: {type(error).__name__}: {error}", file=sys.stderr)
-    spent["sysid"] = np.array([time.monotonic(), time.process_time()]) - now
-    rows += [{"method": "sysid", "parameter": name, "value": value} for name, value in (found or {}).items()]
-    nominal = {"mass upper": 1.0, "mass fore": 0.6, "frictionloss elbow": FRICTION, "frictionloss shoulder": 0.0}
-    for row in rows:
-        row["truth"] = nominal.get(row["parameter"], 0.01 if "armature" in row["parameter"] else 0.05)
-        row["seconds"], row["cpu_seconds"] = spent[row["method"]].round(1).tolist()
+    took = spent() - begun
+    rows += [{"system": "two-joint arm", "method": "sysid", "parameter": name, "value": value, **times(took)} for name, value in (found or {}).items()]
+    rows += diagnosed("Hopper", "Hopper-v4", falls[:number], falls[number:])
+    torso = mujoco.MjModel.from_xml_path(str(model_path("Hopper-v4"))).body("torso").mass[0]
+    truth = {"mass upper": 1.0, "mass fore": 0.6, "frictionloss shoulder": 0.0, "frictionloss elbow": FRICTION, "mass torso": HEAVIER * torso}
+    truth |= {f"{field} {joint}": value for joint in ("shoulder", "elbow") for field, value in (("armature", 0.01), ("damping", 0.05))}
     options.out.parent.mkdir(exist_ok=True)
-    write_table(options.out, ("method", "parameter", "value", "low", "high", "truth", "seconds", "cpu_seconds"),
-                ({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows))
+    write_table(options.out, ("system", "method", "parameter", "value", "low", "high", "truth", "seconds", "cpu_seconds"),
+                ({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in {**row, "truth": truth.get(row["parameter"])}.items()} for row in rows))
     print(options.out.read_text())
 
 

@@ -2,7 +2,7 @@
 
     python benchmarks/real.py [--recordings ../shared/recordings] [--only emps double_pendulum]
 
-Recordings are not part of this repository; what is absent is skipped. One row per finding.
+Recordings are not part of this repository; what is absent is skipped, and keeps its rows. One row per finding.
 """
 
 import argparse
@@ -54,14 +54,16 @@ def rows_of(folder, rig, model, pattern, expected):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--recordings", type=Path, default=ROOT / ".." / "shared" / "recordings", help="folder of the rigs")
-    parser.add_argument("--only", nargs="*", help="rigs, or ball names, to do again; the other rows of the table stay")
+    parser.add_argument("--only", nargs="*", help="rigs, or ball names, to do again (all)")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "real.csv")
     options = parser.parse_args()
-    kept = list(csv.DictReader(options.out.open())) if options.only and options.out.exists() else []
+    kept = list(csv.DictReader(options.out.open())) if options.out.exists() else []
     for case in CASES:
         if options.only and not {case[0], case[2]} & set(options.only):
             continue
         new = rows_of(options.recordings, *case)
+        if not new:
+            continue
         kept = [r for r in kept if (r["rig"], r["model"]) != case[:2]] + new
         for row in new:
             print(*(row.get(k) for k in ("rig", "model", "verdict", "effect", "place", "value", "low", "high", "also_possible", "seconds")), flush=True)

@@ -29,13 +29,14 @@ PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="arm"><joi
 NOISE = 5e-4
 
 
-def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=NOISE):
+def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=NOISE, finer=1):
     """A run of the pendulum in stock MuJoCo: sines and steps, position measured every 10 ms with noise.
 
     push(time, qpos, qvel): torque that no catalogue knows of.
     """
     rng = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(PENDULUM.format(damping=damping, mass=mass))
+    model.opt.timestep /= finer
     data = mujoco.MjData(model)
     rows, period, phase = round(seconds / 0.01), rng.uniform(0.6, 1.2, 3), rng.uniform(0, 6, 3)
     time = 0.01 * np.arange(rows)
@@ -45,7 +46,7 @@ def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=N
     for t in range(rows):
         qpos[t] = data.qpos
         data.ctrl[:] = ctrl[t]
-        for _ in range(2):
+        for _ in range(2 * finer):
             data.qfrc_applied[:] = push(data.time, data.qpos[0], data.qvel[0]) if push else 0.0
             mujoco.mj_step(model, data)
     return Recording(name, time, qpos + noise * rng.normal(size=qpos.shape), np.full((rows, 1), np.nan), ctrl, {})
@@ -204,6 +205,20 @@ def test_values_for_windows_are_those_that_other_recordings_say():
     before, after = (earning.overall(earning.gaps(world, s, windows, noise)) for s in ([{}] * len(windows), settings))
     assert after < 0.5 * before
     assert after == pytest.approx(evidence.prediction_error(world, fit.hypothesis.settings, runs[1:], noise)[0], rel=0.02)
+
+
+def test_intervals_allow_for_a_finer_step_where_the_data_do():
+    width = {}
+    for finer in (1, 8):
+        runs = [recorded(f"run{k}.csv", k, damping=0.06, finer=finer) for k in range(4)]
+        world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+        problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.5)], np.array([NOISE]), np.array([np.inf]))
+        damping = world.candidate("viscous_damping", "pivot")
+        [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(damping, (0.058,))], shooting.fit_starts(problem, misfit.Hypothesis()))
+        [(low, high)] = findings.intervals(selection.Search(world, problem, runs), fit)[damping]
+        assert low < 0.06 < high
+        width[finer] = high - low
+    assert width[1] < width[8] / 5
 
 
 def test_an_effect_that_does_not_predict_other_recordings_better_goes():
