@@ -27,7 +27,7 @@ def suspect(problem, fit, largest):
     for _ in range(STEPS):
         before, ratio = min([(before, ratio)] + [(left(problem, r, alone), r) for r in (ratio - reach, ratio + reach)])
         reach /= 2
-    if bare - before < ENOUGH * (bare - fit.chi2.sum()):
+    if before == bare or bare - before < ENOUGH * (bare - fit.chi2.sum()):
         return None
     return (f"the recordings' clock seems to run {abs(1 / ratio - 1):.1%} {'fast' if ratio < 1 else 'slow'}: with their time "
             f"counted {ratio:.3f} times, the largest finding alone explains what all do; check the sampling rate first")

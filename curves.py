@@ -77,7 +77,7 @@ class Unknown(JointEffect):
         if self.variable == f'velocity:{joint.name}':
             powers, field = [x, x * abs(x), x**3], joint.damping
         elif self.variable == f'position:{joint.name}':
-            shift = x - model.qpos_spring[model.jnt_qposadr[i]]
+            shift = x - spec.copy().compile().joint(joint.name).qpos_spring[0]  # where an offset may have moved it
             powers, field = [shift, shift**2, shift**3], joint.stiffness
         else:
             return 'none'

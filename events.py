@@ -20,6 +20,7 @@ CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the 
 QUIET = 3.0  # squared residual over the noise's, of the windows without an event, above which something else is wrong
 ALONE = 0.9  # of an event's gain, the share of one window, above which that window is odd rather than an event
 LONGEST = 0.6  # of a recording: what lasts longer is no event
+USUAL = {1: 0.148, 2: 0.713, 3: 1.424}  # quantile 0.3 of chi-square
 
 
 @dataclass
@@ -51,27 +52,29 @@ def find(world, problem, fit):
     pairs = tried(world)
     if not pairs or len(problem.windows) < 12:
         return None
-    settings, where, moves = [], [], []
-    for steady, _ in pairs:
-        moved, step = shooting.perturbed(misfit.Hypothesis(((steady, steady.nominal),)))
+    settings, where, moves, bases = [], [], [], []
+    for steady, timed in pairs:
+        base = np.array(fit.hypothesis.settings.get(steady, steady.nominal))  # what a fit holds of it already
+        moved, step = shooting.perturbed(misfit.Hypothesis(((steady, base),)))
+        bases.append(np.array(timed.nominal) if steady is timed else base)  # a push adds to one that lasts, a load takes the mass's place
         where.append(range(len(settings), len(settings) + len(step)))
         settings += [{**fit.hypothesis.settings, steady: m[steady]} for m in moved]
         moves.append(step)
     scan = shooting.project(problem, fit, shooting.columns(problem, [fit], [settings])[0])
-    rows = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
+    rows = problem.free
     if np.quantile(scan.chi2 / rows, 0.3) > QUIET:
         return None
     usual = np.quantile(scan.chi2 / rows, 0.3) * (rows + 2 * np.sqrt(2 * rows))  # with the scatter of white noise
     excess = (scan.chi2 - usual).clip(0).sum()
     best, everything = None, []
     recordings = list({id(w.recording): w.recording for w in problem.windows}.values())
-    for (steady, timed), columns, step in zip(pairs, where, moves):
+    for (_, timed), columns, step, base in zip(pairs, where, moves, bases):
         keep = [c for c in columns if scan.gram[:, c, c].sum() > shooting.UNSEEN]
         if not keep:
             continue
         score, gram = scan.score[:, keep], scan.gram[:, keep][:, :, keep]
         alone = np.array([s @ scores.solve_small(g, s) for s, g in zip(score, gram)])
-        spread = max(np.quantile(alone, 0.3) / len(keep) * 2, 1.0)  # what windows without an event show
+        spread = max(np.quantile(alone, 0.3) / USUAL[len(keep)], 1.0)  # what windows without an event show
         for r in recordings:
             mine = np.array([i for i, w in enumerate(problem.windows) if w.recording is r])
             for a in range(len(mine)):
@@ -83,8 +86,8 @@ def find(world, problem, fit):
                     if share < ALONE * gain and (best is None or gain > best[0]):
                         full = np.zeros(len(columns))
                         full[[c - columns[0] for c in keep]] = value
-                        best = gain, timed, np.array(timed.nominal) + full * step, r, mine[a], mine[b], len(keep), spread
-        everything.append((timed, columns, keep, step, score, gram))
+                        best = gain, timed, base + full * step, r, mine[a], mine[b], len(keep), spread
+        everything.append((timed, columns, keep, step, base, score, gram))
     if best is None:
         return None
     gain, timed, values, r, a, b, k, spread = best
@@ -96,12 +99,12 @@ def find(world, problem, fit):
     time = r.time[problem.windows[a].first], r.time[problem.windows[b].last]
     event = refined(world, problem, fit, Event(None, tuple(np.clip(values, low, high)), r, time, float(min(p, 1))), timed)
     inside, others = [i for i in range(a, b + 1) if problem.windows[i].recording is r], []
-    for other, columns, keep, step, score, gram in everything:
+    for other, columns, keep, step, base, score, gram in everything:
         if other != timed:
             s, g = score[inside].sum(0), gram[inside].sum(0)
             value = scores.solve_small(g, s)
             if s @ value > 0.8 * gain:
-                full = np.array(other.nominal)
+                full = base.copy()
                 full[[c - columns[0] for c in keep]] += value * step[[c - columns[0] for c in keep]]
                 others.append((world.localised(other, event.when), full))
     rest = fit.hypothesis

@@ -6,7 +6,6 @@
 
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 import evidence

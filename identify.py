@@ -183,7 +183,7 @@ def lowered_noise(world, train, position, velocity, hypothesis):
     left = np.array([np.sqrt(np.median(s[r > 3] / (r[r > 3] - 2))) if (r > 3).any() else np.inf for s, r in zip(square.T, rows.T)])
     left = np.maximum(left, 1e-9)
     for dofs in cut.channels(model).values():
-        left[dofs] = np.sqrt(np.mean(left[dofs] ** 2))
+        left[dofs] = cut.pooled(left[dofs])
     return np.minimum(position, left[:model.nv]), np.minimum(velocity, left[model.nv:]) if len(left) > model.nv else velocity
 
 
@@ -216,8 +216,7 @@ def problem_of(world, recordings, position_noise, velocity_noise, event, span, s
 
 def missed(problem, fit):
     """Median residual of windows, in noises."""
-    rows = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
-    return np.sqrt(np.median(fit.chi2 / rows))
+    return np.sqrt(np.median(fit.chi2 / problem.free))
 
 
 def follows(problem, fit, share_allowed):
@@ -243,7 +242,7 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
     duration = np.median([np.ptp(r.time) for r in train])
     shortest = max(least(train) * sample, at_least)
     if sum(len(r.time) for r in train) < FEW_ROWS:  # too little to be cut
-        return float(duration)
+        return float(max(np.ptp(r.time) for r in train))
     enough = sum(np.ptp(r.time) for r in train) / 12  # clusters need windows
     longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration, enough))
     if longest < MORE * at_least:

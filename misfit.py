@@ -115,6 +115,17 @@ class Problem:
         self.size = self.weight[0].size + 2 * nv
         self.key = tuple((id(r), *rows) for r, *rows in self.windows), position_noise.tobytes(), np.asarray(velocity_noise).tobytes()
 
+    @property
+    def taken(self):
+        """(W,) how many of a window's rows its start state takes up: two for each dof that was measured there."""
+        seen, nv = (self.weight > 0).any(1), self.model.nv
+        return 2 * (seen[:, :nv] | seen[:, -nv:]).sum(1)
+
+    @property
+    def free(self):
+        """(W,) how many it does not, at least one."""
+        return np.maximum((self.weight > 0).sum((1, 2)) - self.taken, 1)
+
     def subset(self, keep):
         out = object.__new__(Problem)
         out.__dict__.update(self.__dict__)

@@ -37,4 +37,7 @@ def observed(world, windows, settings):
         apart = np.array([np.diff(windows[i].recording.time[at[i] - 1:at[i] + 1]) for i in live])
         qpos[live] = cut.integrate(model, predicted, missed)
         qvel[live] = np.where(np.isfinite(known), known, speed + GAIN * missed / apart)
+        lost = live[~(np.isfinite(qpos[live]).all(1) & np.isfinite(qvel[live]).all(1))]  # it blew up: as recorded, and on from there
+        if len(lost):
+            qpos[lost], qvel[lost] = cut.recorded_starts(model, [windows[i]._replace(first=at[i], last=at[i] + 1) for i in lost])
     return qpos, qvel

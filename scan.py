@@ -48,15 +48,15 @@ class Trial:
 
 def freedom(problem):
     """Measured rows that start states do not take up."""
-    return max(problem.rows - 2 * problem.model.nv * len(problem.windows), 1)
+    return max(problem.rows - problem.taken.sum(), 1)
 
 
 def unseen(world, place, recordings):
-    """Whether a place is a joint whose position was never measured: nothing tells where its probes should lie."""
+    """Whether a place is a joint whose motion was never measured: nothing tells where its probes should lie."""
     if place.kind != "joint":
         return False
     q = world.model.jnt_qposadr[world.model.joint(place.name).id]
-    return not any(np.isfinite(r.qpos[:, q]).any() for r in recordings)
+    return not any(np.isfinite(r.qpos[:, q]).sum() > 1 for r in recordings)
 
 
 def options_of(world, recordings):
@@ -92,7 +92,8 @@ class Scan:
         self.places = len({o.candidate for o in self.options})
         labels = scores.clusters(problem.windows)
         count = labels.max() + 1
-        self.pieces = 1 if count >= 16 else min(-(-16 // count), max(problem.weight.shape[1] // 4, 1))
+        many = len({id(w.recording) for w in problem.windows}) >= scores.MANY  # they are the clusters then, whole
+        self.pieces = 1 if many or count >= 16 else min(-(-16 // count), max(problem.weight.shape[1] // 4, 1))
         if self.pieces > 1:
             labels = np.arange(len(problem.windows) * self.pieces)
         self.labels = labels
@@ -162,9 +163,9 @@ class Scan:
         options = [o for o in options if o.linear] + self.screened(fit, [o for o in options if not o.linear])
         # an option that promises little with the columns it had at an earlier fit is not simulated anew at this one
         older = [o for o in options if o in self.looked and self.looked[o][0] is not fit]
-        for rank, t in enumerate(self.scan(fit, older, self.problem)[0] if older else []):
-            if rank < PROMISING or t.gain > WORTH / 4 * t.chi2:
-                del self.looked[t.option]
+        found = self.scan(fit, older, self.problem)[0] if older else []
+        poor = {t.option for rank, t in enumerate(found) if rank >= PROMISING and t.gain <= WORTH / 4 * t.chi2}
+        self.looked = {o: known for o, known in self.looked.items() if o in poor or o not in older}  # what was never seen is looked at too
         return self.scan(fit, options, self.problem)
 
     def screened(self, fit, options, most=16):
@@ -222,6 +223,8 @@ class Scan:
 
         An option of several columns takes part with their best single combination.
         """
+        if not trials:
+            return []
         total, pull = gram.sum(0), score.sum(0)
         mix = np.zeros((len(total), len(trials)))
         for i, t in enumerate(trials):

@@ -13,6 +13,7 @@ import numpy as np
 LITTLE = 0.05  # of a column's size, seen outside a cluster, below which its value there counts as not known
 
 ALONE = 0.3  # of a column's size, in one cluster
+MANY = 12  # recordings, from which on each is a cluster
 
 
 def f_survival(f, a, b):
@@ -67,7 +68,7 @@ def clusters(windows, most=30):
         if not any(w.recording is r for r in recordings):
             recordings.append(w.recording)
     owner = np.array([next(i for i, r in enumerate(recordings) if w.recording is r) for w in windows])
-    if len(recordings) >= 12:
+    if len(recordings) >= MANY:
         return owner
     labels, at = np.zeros(len(windows), int), 0
     for i in range(len(recordings)):

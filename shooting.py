@@ -129,7 +129,7 @@ def led(problem, fits):
     any other start ends in a local minimum. Windows are poor beside the best quarter of their fit. Where rows are far apart
     it begins with the observer's state and three rows, else with the recorded one and eight.
     """
-    free = np.maximum((problem.weight > 0).sum((1, 2)) - 2 * problem.model.nv, 1)
+    free = problem.free
     each = np.array([f.chi2 / free for f in fits])
     owner, which = np.nonzero(each > (1 + POOR * np.sqrt(2 / free)) * np.quantile(each, 0.25, axis=1, keepdims=True))
     if not len(which):

@@ -159,10 +159,10 @@ class ContactFriction(ContactEffect):
 
     def parameters(self, model, i):
         mu = self.pair(model, i)[1][0]
-        return Parameter('sliding', '1', mu, 1e-4, 10.0, 0.02 * mu),
+        return Parameter('sliding', '1', mu, min(mu, 1e-4), 10.0, 0.02 * mu or 0.02),
 
     def far(self, model, i, recordings):
-        return [(factor * self.pair(model, i)[1][0],) for factor in (0.5, 0.2)]  # what sticks has no gradient
+        return [(factor * (self.pair(model, i)[1][0] or 1.0),) for factor in (0.5, 0.2)]  # what sticks has no gradient
 
     @staticmethod
     def change(friction, solref, values):

@@ -103,7 +103,7 @@ def curves(world, problem, v, joint, few):
     knots = np.linspace(v.time.min(), v.time.max(), 4)
     out += [world.curve(name, "time", knots, factor=control(model, a)) for a in drives(model, joint)]
     here = v.position[few, model.jnt_qposadr[joint]]
-    if few.any() and np.ptp(here) < 0.3 * np.ptp(v.position[:, model.jnt_qposadr[joint]]):
+    if few.any() and 0 < np.ptp(here) < 0.3 * np.ptp(v.position[:, model.jnt_qposadr[joint]]):
         knots = spread_knots(here, KNOTS // 2)
         knots = [knots[0] - 0.5 * np.ptp(knots), *knots, knots[-1] + 0.5 * np.ptp(knots)]
         out += [world.curve(name, f"position:{name}", knots, factor=f) for f in (None, f"velocity:{name}")]

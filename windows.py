@@ -120,6 +120,10 @@ def states(model, recording):
     time = recording.time
     qpos, qvel = np.array(recording.qpos, float), np.array(recording.qvel, float)
     for _, kind, q, v in joint_slices(model):
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):  # q and -q are one rotation: between holes too
+            quat = qpos[:, q.stop - 4:q.stop]
+            known = np.flatnonzero(np.isfinite(quat).all(1))
+            quat[known[1:]] *= np.where(np.cumsum((quat[known[1:]] * quat[known[:-1]]).sum(1) < 0) % 2, -1.0, 1.0)[:, None]
         for i in range(q.start, q.stop):
             if np.isfinite(qpos[:, i]).any() or kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
                 qpos[:, i] = _filled(time, qpos[:, i], model.qpos0[i])
@@ -253,8 +257,14 @@ def measurement_noise(model, recordings):
             found = np.array(found)[np.isfinite(found)]
             noise[dof] = np.median(found) if len(found) else np.inf
     for name, dofs in channels(model).items():  # components of one channel share their noise
-        position[dofs] = np.sqrt(np.mean(position[dofs] ** 2))
+        position[dofs] = pooled(position[dofs])
     return position, velocity
+
+
+def pooled(noise):
+    """The noise of a channel, from those of its components that moved; inf where none did."""
+    finite = noise[np.isfinite(noise)]
+    return np.sqrt(np.mean(finite**2)) if len(finite) else np.inf
 
 
 def _tangent_column(model, recording, dof):
@@ -264,5 +274,5 @@ def _tangent_column(model, recording, dof):
                 return recording.qpos[:, q.start]
             if kind == mujoco.mjtJoint.mjJNT_FREE and dof < v.start + 3:
                 return recording.qpos[:, q.start + dof - v.start]
-            step = difference(model, recording.qpos[:-1], recording.qpos[1:])[:, dof]
-            return np.concatenate([[0], np.cumsum(step)])
+            known = recording.qpos[np.isfinite(recording.qpos[:, q.stop - 4:q.stop]).all(1)]
+            return np.cumsum(difference(model, known[:-1], known[1:])[:, dof])
