@@ -5,7 +5,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from effects import HUGE, JOINT_TRANSMISSION, Effect, Parameter, catalogue, constant_force, runge_kutta, turns
+from effects import (HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Effect, Parameter, catalogue, constant_force, explicit_inertia, runge_kutta,
+                     turns)
 
 
 class ActuatorEffect(Effect):
@@ -15,6 +16,11 @@ class ActuatorEffect(Effect):
     def fits(self, model, i):
         affine = model.actuator_gaintype[i] in (0, 1) and model.actuator_biastype[i] in (0, 1)
         return affine and model.actuator_ctrlnum[i] == 1 and model.actuator_outnum[i] == 1
+
+    @staticmethod
+    def on_joint(model, i):
+        """Whether it acts on a hinge or slide."""
+        return model.actuator_trntype[i] == JOINT_TRANSMISSION and model.jnt_type[model.actuator_trnid[i, 0]] in (HINGE, SLIDE)
 
     @staticmethod
     def strength(model, i):
@@ -30,7 +36,7 @@ class ActuatorEffect(Effect):
     def forces(model, i, recordings):
         """|force| that the recorded controls asked for, but for velocity feedback."""
         asked = [model.actuator_gainprm[i, 0] * r.ctrl[:, model.actuator_ctrladr[i]] for r in recordings]
-        if model.actuator_biasprm[i, 1] and model.actuator_trntype[i] == JOINT_TRANSMISSION:
+        if model.actuator_biasprm[i, 1] and ActuatorEffect.on_joint(model, i):
             q = model.jnt_qposadr[model.actuator_trnid[i, 0]]
             k = model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0]
             asked = [F + k * r.qpos[:, q] for F, r in zip(asked, recordings)]
@@ -107,7 +113,7 @@ class BackEmf(ActuatorEffect):
 
     def parameters(self, model, i):
         nominal, step = -model.actuator_biasprm[i, 2], 0.01 * self.strength(model, i)
-        if model.actuator_trntype[i] == JOINT_TRANSMISSION:
+        if self.on_joint(model, i) and model.actuator_gear[i, 0]:
             step = 0.02 * model.dof_M0[model.jnt_dofadr[model.actuator_trnid[i, 0]]] / model.actuator_gear[i, 0]**2
         unit = {'N·m': 'N·m·s/rad', 'N': 'N·s/m'}[self.unit(model, i)]
         return Parameter('damping', unit, nominal, 0.0, HUGE * step, max(step, 0.01 * nominal)),
@@ -179,6 +185,9 @@ class Delay(ActuatorEffect):
     def write(self, spec, model, i, values):
         """MuJoCo reads its history as of each force evaluation, but only what was there before the step."""
         seconds, actuator, step = values[0], spec.actuator(model.actuator(i).name), spec.option.timestep
+        actuator.delay, actuator.nsample = 0.0, 0
+        if not seconds:
+            return 'mjcf'
         if runge_kutta(model):  # evaluates half a step later on average, a whole one at the last
             refine(spec, seconds / 1.5)
             seconds += spec.option.timestep / 2
@@ -203,7 +212,8 @@ class DeadZone(ActuatorEffect):
     name, simplicity, amplitudes, related = 'dead_zone', 2, 1, ('coulomb_friction', 'gain')
 
     def fits(self, model, i):
-        return super().fits(model, i) and (not self._servo(model, i) or model.actuator_trntype[i] == JOINT_TRANSMISSION)
+        motor = model.actuator_gainprm[i, 0] and not self._servo(model, i)
+        return super().fits(model, i) and (motor or self.on_joint(model, i) and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE))
 
     @staticmethod
     def _servo(model, i):
@@ -249,8 +259,9 @@ class DeadZone(ActuatorEffect):
         spring has a dead band hands on what is beyond it, about half a time step later, once it is wound up."""
         motor = spec.actuator(model.actuator(i).name)
         plain = not motor.biasprm[1:3].any() and motor.dyntype == mujoco.mjtDyn.mjDYN_NONE
-        if model.actuator_trntype[i] != JOINT_TRANSMISSION or not plain:
+        if not (self.on_joint(model, i) and plain):
             return 'none'
+        explicit_inertia(spec, model)  # a total mass would count the wheel
         h, gain, gear, joint = spec.option.timestep, abs(motor.gainprm[0]), motor.gear[0], motor.target
         name = f'dead_zone:{motor.name}'
         k = 1e-3 * self.strength(model, i)  # so soft that it travels far, and the joint's own travel adds nothing

@@ -133,7 +133,7 @@ class Effect:
         """The parameters with steps and bounds that suit the recorded motion."""
         return parameters
 
-    def possible(self, values):
+    def possible(self, values, nominal):
         """Whether a real machine can have these values, and not another effect by this name."""
         return True
 
@@ -208,6 +208,20 @@ def displace(spec, kind, name, by):
         element.fromto += np.tile(turn @ by, 2)
     else:
         element.pos += turn @ by
+
+
+def explicit_inertia(spec, model):
+    """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot be edited."""
+    compiler, on = spec.compiler, mujoco.mjtInertiaFromGeom
+    # even over what the file says
+    implied = compiler.inertiafromgeom == on.mjINERTIAFROMGEOM_TRUE or compiler.settotalmass > 0
+    compiler.inertiafromgeom, compiler.settotalmass, compiler.balanceinertia = on.mjINERTIAFROMGEOM_AUTO, -1, False
+    for body in spec.bodies[1:]:
+        i, explicit = model.body(body.name).id, body.explicitinertial and not np.isfinite(body.fullinertia[0])
+        if (implied or not explicit) and model.body_mass[i] > 0:
+            body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
+            body.mass, body.ipos, body.inertia = model.body_mass[i], model.body_ipos[i], model.body_inertia[i]
+            body.ialt.type, body.iquat = mujoco.mjtOrientation.mjORIENTATION_QUAT, model.body_iquat[i]
 
 
 def angle(spec, model, j, value):

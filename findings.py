@@ -193,9 +193,8 @@ def figure(world, settings, recordings, position_noise, velocity_noise):
             channels.setdefault(channel, {})[name] = value
     out["floor"], per_channel = evidence.floor_error(world, settings, recordings, position_noise, velocity_noise)
     for channel, value in per_channel.items():
-        channels[channel]["floor"] = value
-        channels[channel]["unit"] = unit_of(world.model, channel)
-    out["channels"] = channels
+        channels[channel] |= {"floor": value, "unit": unit_of(world.model, channel)}
+    out["channels"] = {name: values for name, values in channels.items() if "floor" in values}  # seldom measured, a channel may have none
     return out
 
 

@@ -191,7 +191,7 @@ class StribeckFriction(JointEffect):
         slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
         return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
 
-    def possible(self, values):
+    def possible(self, values, nominal):
         """It falls with speed, by enough to matter."""
         return values[1] > (1 + FALLS) * values[0]
 

@@ -44,7 +44,7 @@ class Hypothesis:
     @property
     def possible(self):
         """Whether all values are such as a real machine can have, the effects being what they are called."""
-        return all(c.effect.possible(values) for c, values in self.effects)
+        return all(c.effect.possible(values, c.nominal) for c, values in self.effects)
 
     def moved(self, vector):
         out, at = [], 0

@@ -13,24 +13,10 @@ import numpy as np
 import surroundings  # noqa: F401, I001  (their effects join the catalogue, in this order)
 from joints import JointEffect
 import actuators     # noqa: F401
-from effects import (EFFECTS, HINGE, HUGE, SLIDE, Candidate, Effect, Parameter, Place, authored,  # noqa: F401  (EFFECTS to others)
-                     catalogue, constant_force, displace, turns)
+from effects import (EFFECTS, HINGE, HUGE, JOINT_TRANSMISSION, JOINT_TRANSMISSIONS, SLIDE, Candidate,  # noqa: F401  (EFFECTS to others)
+                     Effect, Parameter, Place, authored, catalogue, constant_force, displace, explicit_inertia, turns)
 
 REST, RESTING = 0.02, 0.05  # share of a joint's travel about its end, and of all rows found there, where it seems to lie at its stop
-
-
-def explicit_inertia(spec, model):
-    """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot be edited."""
-    compiler, on = spec.compiler, mujoco.mjtInertiaFromGeom
-    # even over what the file says
-    implied = compiler.inertiafromgeom == on.mjINERTIAFROMGEOM_TRUE or compiler.settotalmass > 0
-    compiler.inertiafromgeom, compiler.settotalmass, compiler.balanceinertia = on.mjINERTIAFROMGEOM_AUTO, -1, False
-    for body in spec.bodies[1:]:
-        i, explicit = model.body(body.name).id, body.explicitinertial and not np.isfinite(body.fullinertia[0])
-        if (implied or not explicit) and model.body_mass[i] > 0:
-            body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
-            body.mass, body.ipos, body.inertia = model.body_mass[i], model.body_ipos[i], model.body_inertia[i]
-            body.ialt.type, body.iquat = mujoco.mjtOrientation.mjORIENTATION_QUAT, model.body_iquat[i]
 
 
 class InertialEffect(Effect):
@@ -110,12 +96,21 @@ class Inertia(InertialEffect):
         moments = zip(('ixx', 'iyy', 'izz'), model.body_inertia[i])
         return tuple(Parameter(n, 'kg·m²', I, 0.02 * I, 100 * I, 0.02 * I) for n, I in moments)
 
-    def possible(self, values):
-        """No principal moment of a rigid body is larger than the sum of the others."""
-        return 2 * max(values) <= sum(values) * (1 + 1e-6)
+    def possible(self, values, nominal):
+        """No principal moment of a rigid body is larger than the sum of the others; one at its nominal value did not show, and may be any."""
+        return 2 * max(values) <= sum(values) * (1 + 1e-6) or any(v == n for v, n in zip(values, nominal))
 
     def edit(self, model, i, values):
         model.body_inertia[i] = values
+
+    def write(self, spec, model, i, values):
+        """As fitted; what did not show moves along as far as a rigid body needs, for no other compiles."""
+        moments, more = list(values), 1 + 1e-6
+        for k in sorted((k for k in range(3) if values[k] == model.body_inertia[i][k]), key=lambda k: -values[k]):
+            one, other = moments[:k] + moments[k + 1:]
+            moments[k] = min(max(moments[k], more * abs(one - other)), (one + other) / more)
+        lacking = max(2 * max(moments) - sum(moments), 0.0) / 2
+        return super().write(spec, model, i, [m if m == max(moments) else m + more * lacking for m in moments])
 
 
 @catalogue
@@ -158,7 +153,8 @@ class ExternalForce(Effect):
     def write(self, spec, model, i, values):
         body = spec.body(model.body(i).name)
         name, origin = f'external_force:{body.name}', f'external_force:{body.name}:world'
-        body.add_site(name=name, pos=body.ipos if body.explicitinertial else model.body_ipos[i])
+        explicit = body.explicitinertial and spec.compiler.inertiafromgeom != mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+        body.add_site(name=name, pos=body.ipos if explicit else model.body_ipos[i])
         spec.worldbody.add_site(name=origin)
         motor = constant_force(spec, name, 1.0, mujoco.mjtTrn.mjTRN_SITE, name)
         motor.refsite, motor.gear = origin, [*values, 0.0, 0.0, 0.0]
@@ -209,9 +205,14 @@ class SensorBias(SensorEffect):
 
     @staticmethod
     def shared(model, i):
-        """Whether a fixed tendon, or an actuator in the parent's frame, reads the joint too: their zeros would move along."""
+        """Whether what reads the joint too would see its zero move: a fixed tendon, an actuator in the parent's frame, a muscle."""
         wrapped = (model.wrap_objid == i) & (model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT)
-        return wrapped.any() or ((model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINTINPARENT) & (model.actuator_trnid[:, 0] == i)).any()
+        gain, bias = mujoco.mjtGain, mujoco.mjtBias
+        plain = (model.actuator_trntype == JOINT_TRANSMISSION) & np.isin(
+            model.actuator_biastype, [int(b) for b in (bias.mjBIAS_NONE, bias.mjBIAS_AFFINE, bias.mjBIAS_DCMOTOR)]) & (
+            (model.actuator_gaintype != int(gain.mjGAIN_AFFINE)) | (model.actuator_gainprm[:, 1] == 0))
+        own = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == i)
+        return wrapped.any() or (own & ~plain).any()
 
     def write(self, spec, model, i, values):
         if self.kind == 'sensor' or self.shared(model, i):
@@ -224,7 +225,7 @@ class SensorBias(SensorEffect):
                 shift = actuator.gear[0] * values[0]
                 if actuator.biastype == mujoco.mjtBias.mjBIAS_DCMOTOR:
                     actuator.biasprm[2] -= actuator.biasprm[1] * shift
-                elif actuator.biasprm[1]:
+                elif actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[1]:
                     actuator.type = mujoco.mjtActuator.mjACTUATOR_GENERAL
                     actuator.biasprm[0] -= actuator.biasprm[1] * shift
         return 'mjcf'

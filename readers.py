@@ -166,7 +166,7 @@ def _csv(path, data, model):
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     above, first, body = _header_line(text)
     try:
-        header = next(csv.reader([first], strict=True), [])
+        header = next(csv.reader([first], strict=True, skipinitialspace=True), [])
     except csv.Error as error:
         raise RecordingError(f"{path}: row {above + 1}: the header cannot be read ({error}); write plain column names") from None
     if "time" not in [cell.strip() for cell in header]:

@@ -30,6 +30,8 @@ class ReportError(ValueError):
 
 def check_folder(out):
     """Raises ReportError where a folder `out` cannot be written, before any computing is done."""
+    if not out:
+        raise ReportError("--out: no folder given; give the name of one to write")
     here = os.path.abspath(out)
     while not os.path.lexists(here):
         here = os.path.dirname(here)

@@ -119,6 +119,13 @@ class ContactEffect(Effect):
     @classmethod
     def pair(cls, model, i):
         """What geom i's contacts have nominally: condim, friction (3,), solref (2,), solimp (5,)."""
+        condim, friction, solref, solimp = cls._mixed(model, i)
+        if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE) and solref[0] > 0:
+            solref[0] = max(solref[0], 2 * model.opt.timestep)  # as MuJoCo does
+        return condim, friction, solref, solimp
+
+    @classmethod
+    def _mixed(cls, model, i):
         j = cls.partner(model, i)
         condim, friction, solref, solimp = (getattr(model, f'geom_{f}')[[i, j]] for f in ('condim', 'friction', 'solref', 'solimp'))
         if model.geom_priority[i] != model.geom_priority[j]:
@@ -137,10 +144,10 @@ class ContactEffect(Effect):
         self.change(model.geom_friction[i], model.geom_solref[i], values)
 
     def write(self, spec, model, i, values):
-        geom = spec.geom(model.geom(i).name)
-        if geom.priority <= model.geom_priority.min():
-            geom.condim, geom.friction, geom.solref, geom.solimp = self.pair(model, i)
-            geom.priority = model.geom_priority.max() + 1
+        geom, so_far = spec.geom(model.geom(i).name), spec.copy().compile()  # with what was written of other contacts
+        if geom.priority <= so_far.geom_priority.min():
+            geom.condim, geom.friction, geom.solref, geom.solimp = self.pair(so_far, so_far.geom(geom.name).id)
+            geom.priority = so_far.geom_priority.max() + 1
         self.change(geom.friction, geom.solref, values)
         return 'mjcf'
 

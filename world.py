@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 import curves
+from effects import HINGE, SLIDE
 from engine import Engine
 from physics import EFFECTS, Candidate, Place
 from signals import SLACK
@@ -48,7 +49,14 @@ class World:
                     if not element.name:
                         index = str(element.id)
                         element.name = f'index {index}' if index in taken else index
-            self.model = self.spec.compile()
+            self.model = m = self.spec.compile()
+        for actuator in s.actuators:  # what the compiler works out of the mass, it would again of another one
+            if actuator.biasprm[2] > 0:
+                actuator.biasprm[2] = m.actuator(actuator.name).biasprm[2]
+        for joint in s.joints:
+            if any(joint.springdamper):
+                j = m.joint(joint.name)
+                joint.stiffness, joint.damping, joint.springdamper = [j.stiffness[0], 0, 0], [j.damping[0], 0, 0], [0, 0]
         self.candidates, taken = [], {e.name for e in (*self.spec.actuators, *self.spec.joints)}
         for effect in EFFECTS:
             for name in effect.places(self.model):
@@ -204,11 +212,15 @@ class World:
         spec.meshdir, spec.texturedir = str(folder / self.spec.meshdir), str(folder / self.spec.texturedir)
         spec.compiler.savecompiled = spec.compiler.savecanonical = False
         with quiet():
-            try:
-                spec.compile()
-            except ValueError:  # a fitted inertia that no rigid body has (A + B < C): the nearest that stock MuJoCo takes
-                spec.compiler.balanceinertia = True
-                spec.compile()
+            model = spec.compile()
+            for key, old in zip(spec.keys, self.model.key_qpos):  # joints may have been added between the others, and zeros moved
+                place = model.qpos0.copy()
+                for mine in map(self.model.joint, range(self.model.njnt)):
+                    its, width = model.joint(mine.name), len(mine.qpos0)
+                    moved = its.qpos0 - mine.qpos0 if mine.type[0] in (HINGE, SLIDE) else 0.0
+                    place[its.qposadr[0]:its.qposadr[0] + width] = old[mine.qposadr[0]:mine.qposadr[0] + width] + moved
+                key.qpos = place
+            spec.compile()
             return spec.to_xml(), written
 
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import earning
+import events
 import evidence
 import findings
 import misfit
@@ -219,6 +220,50 @@ def test_intervals_allow_for_a_finer_step_where_the_data_do():
         assert low < 0.06 < high
         width[finer] = high - low
     assert width[1] < width[8] / 5
+
+
+def test_each_of_a_dozen_recordings_is_a_cluster():
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    for number in (11, 13, 20):
+        runs = [recorded(f"run{k}.csv", k, seconds=1.0) for k in range(number)]
+        problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.25)], np.array([NOISE]), np.array([np.inf]))
+        search = selection.Search(world, problem, runs)
+        assert search.pieces == 1 and (search.labels.max() + 1 == number) == (number > 11)
+
+
+def test_what_was_not_seen_at_one_fit_is_looked_at_again_at_the_next():
+    runs = [recorded(f"run{k}.csv", k, damping=0.08) for k in range(2)]
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.5)], np.array([NOISE]), np.array([np.inf]))
+    search, bare = selection.Search(world, problem, runs), shooting.fit_starts(problem, misfit.Hypothesis())
+    search.trials(bare)
+    damping, mass = world.candidate("viscous_damping", "pivot"), world.candidate("mass", "arm")
+    [option] = [o for o in search.options if o.candidate == damping and o.linear]
+    search.looked[option] = bare, np.zeros_like(search.looked[option][1])
+    [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(mass, (0.51,))], bare)
+    assert option in {t.option for t in search.trials(fit)[0]}
+
+
+def loaded(seed, lasting, carried, between, seconds=4.0):
+    """A run of the pendulum, `lasting` times as heavy as nominal, for a while `carried` times."""
+    rng = np.random.default_rng(seed)
+    models = [mujoco.MjModel.from_xml_string(PENDULUM.format(damping=0.05, mass=0.5 * ratio)) for ratio in (lasting, carried)]
+    data, rows = mujoco.MjData(models[0]), round(seconds / 0.01)
+    time, period = 0.01 * np.arange(rows), rng.uniform(0.6, 1.2, 3)
+    ctrl, qpos = (0.4 * np.sin(2 * np.pi * time[:, None] / period)).sum(1, keepdims=True), np.empty((rows, 1))
+    for t in range(rows):
+        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
+        mujoco.mj_step(models[int(between[0] <= time[t] < between[1])], data, 2)
+    return Recording("run.csv", time, qpos + NOISE * rng.normal(size=qpos.shape), np.full((rows, 1), np.nan), ctrl, {})
+
+
+def test_a_load_on_top_of_a_lasting_one_is_placed_in_time():
+    world, run = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5))), loaded(2, 3.0, 4.0, (1.6, 2.4))
+    problem = misfit.Problem(world, cut.consecutive(run, 0.2), np.array([NOISE]), np.array([np.inf]))
+    heavy = misfit.Hypothesis().plus(world.candidate("mass", "arm"), (1.5,))
+    event = events.find(world, problem, shooting.fit_starts(problem, heavy))
+    assert event.candidate.effect.name == "payload_change"
+    assert event.time == pytest.approx((1.6, 2.4), abs=0.05) and event.values[0] == pytest.approx(2.0, rel=0.05)
 
 
 def test_an_effect_that_does_not_predict_other_recordings_better_goes():

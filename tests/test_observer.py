@@ -90,3 +90,11 @@ def test_led_starts_and_bounded_steps_find_a_mass_through_contacts():
     begun = Hypothesis().plus(torso, (1.02 * torso.nominal[0],))
     [fit] = shooting.solve(problem, [begun], shooting.fit_starts(problem, Hypothesis()))
     assert abs(fit.hypothesis.vector[0] / torso.nominal[0] - 1.15) < 0.02
+
+
+def test_a_simulation_that_blows_up_on_the_way_begins_again_as_recorded():
+    world = World(mujoco.MjSpec.from_string(PENDULUM))
+    recording, _ = recorded(world.model, np.zeros((60, 1)), 25)
+    windows = consecutive(recording, 0.2)[2:]
+    qpos, qvel = observed(world, windows, [{world.candidate("bias", world.model.actuator(0).name): (1e14,)}] * len(windows))
+    np.testing.assert_array_equal((qpos, qvel), recorded_starts(world.model, windows))

@@ -8,7 +8,9 @@ import pytest
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import diagnose
+import misfit
 import recordings
+import scan
 import windows as cut
 from leftover import _variable
 from unknown import drives
@@ -128,3 +130,172 @@ def test_recordings_to_fit_that_stand_still(tmp_path, capfd):
     moves = csv(tmp_path / "moves.csv", [(t, np.sin(3 * t), np.sin(2 * t), 0) for t in time])
     status = diagnose.main(["--model", str(tmp_path / "model.xml"), "--recordings", still, "--held-out", moves, "--out", str(tmp_path / "out")])
     assert status == 2 and "nothing moves" in capfd.readouterr().err
+
+
+# ---- what a model's author left to the compiler ------------------------------------------------
+
+TWO = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="2 2 .1"/><body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" {joint}/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1" contype="0"/><body name="b" pos="0 0 -.3"><joint name="k" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1" contype="0"/></body></body></worldbody>
+  <actuator><{actuator} joint="k"/></actuator><keyframe><key qpos="0.1 0.2"/></keyframe></mujoco>"""
+TWO_AXES = 'motor name="m"'
+BOX = """<mujoco><option timestep="{}"/><worldbody><geom name="floor" type="plane" size="2 2 .1" friction="{}"/><body name="box" pos="0 0 .1">
+  <freejoint name="f"/><geom name="box" type="box" size=".1 .1 .1" mass="1" friction="0.5"/></body></worldbody></mujoco>"""
+
+
+def same_motion(world, setting, qpos, qvel, seconds=0.4):
+    """Largest difference between World's simulation of a setting and its corrected.xml in stock MuJoCo."""
+    time = np.arange(round(seconds / 0.01)) * 0.01
+    held = np.full((len(time), world.model.nu), 0.3)
+    run = recordings.Recording("run", time, np.zeros((len(time), world.model.nq)), np.zeros((len(time), world.model.nv)), held)
+    here = world.simulate([setting], np.array([qpos]), np.array([qvel]), [cut.Window(run, 0, len(time) - 1)])[0][0]
+    model = mujoco.MjModel.from_xml_string(world.corrected_xml(setting)[0])
+    data, there = mujoco.MjData(model), []
+    data.qpos[:], data.qvel[:], data.ctrl[:], data.act[:] = qpos, qvel, 0.3, 0.3
+    for a in np.flatnonzero(model.actuator_delay):  # at rest in the first control
+        past = -model.opt.timestep * np.arange(model.actuator_history[a, 0], 0, -1)
+        mujoco.mj_initCtrlHistory(model, data, a, past, np.full(len(past), 0.3))
+    for _ in time:
+        there.append(data.qpos.copy())
+        mujoco.mj_step(model, data, round(0.01 / model.opt.timestep))
+    return np.abs(here - there).max()
+
+
+@pytest.mark.parametrize("joint, actuator", [("", 'position kp="20" dampratio="1"'), ('springdamper="0.5 1"', TWO_AXES)])
+def test_gains_that_the_compiler_works_out_stay_as_they_were(joint, actuator):
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint=joint, actuator=actuator)))
+    servo = world.model.actuator(0).name
+    for effect, place, factor in (("mass", "b", 2.0), ("gain", servo, 1.5), ("armature", "k", None), ("viscous_damping", "j", None)):
+        candidate = world.candidate(effect, place)
+        value = factor * candidate.nominal[0] if factor else 0.1
+        assert same_motion(world, {candidate: (value,)}, [0.3, -0.2], [0.5, 0.0]) < 1e-6, effect
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.001, 0.01, 0.05])
+def test_another_delay_than_the_models_own(seconds):
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator='general name="m" delay="0.02" nsample="10"')))
+    model, form = corrected(world, "delay", "m", seconds)
+    assert form == "mjcf" and model.actuator_delay[0] == (seconds if seconds >= model.opt.timestep else 0)
+    assert same_motion(world, {world.candidate("delay", "m"): (seconds,)}, [0.3, -0.2], [0.5, 0.0]) < 1e-3
+
+
+def test_keyframes_keep_their_poses():
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator=TWO_AXES)))
+    model, _ = corrected(world, "backlash", "k", 0.02)
+    assert [model.key_qpos[0, model.joint(n).qposadr[0]] for n in ("j", "k", "backlash:k")] == [0.1, 0.2, 0.0]
+    driven = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator=TWO_AXES).replace('joint="k"/></act', 'joint="j"/></act')))
+    model, _ = corrected(driven, "backlash", "j", 0.02)  # its joint comes between the two
+    assert [model.key_qpos[0, model.joint(n).qposadr[0]] for n in ("j", "k", "backlash:j")] == [0.1, 0.2, 0.0]
+    np.testing.assert_allclose(corrected(world, "sensor_bias", "k", 0.05)[0].key_qpos[0], [0.1, 0.25])
+
+
+def test_two_things_wrong_with_a_contact_one_at_each_geom():
+    world = World(mujoco.MjSpec.from_string(BOX.format(0.002, 0.5)))
+    friction, stiffness = world.candidate("contact_friction", "floor"), world.candidate("contact_stiffness", "box")
+    setting = {friction: (0.2,), stiffness: (3 * stiffness.nominal[0],)}
+    start = [0, 0, 0.12, 1, 0, 0, 0], [2.0, 0, 0, 0, 0, 0]
+    assert same_motion(world, setting, *start) < 1e-6
+    slid = lambda s: same_motion(world, s, *start)
+    assert slid({friction: (0.2,)}) < 1e-6 and slid({stiffness: setting[stiffness]}) < 1e-6
+
+
+def test_contacts_stiffer_than_a_step_can_carry():
+    coarse = World(mujoco.MjSpec.from_string(BOX.format(0.02, 0.5)))  # MuJoCo makes the default 0.02 s two steps long
+    assert coarse.candidate("contact_stiffness", "box").nominal[0] == pytest.approx(1 / 0.04**2)
+
+
+def test_friction_where_the_model_has_none():
+    world = World(mujoco.MjSpec.from_string(BOX.format(0.002, 0).replace('friction="0.5"', 'friction="0"')))
+    [sliding] = world.candidate("contact_friction", "box").parameters
+    assert sliding.low <= sliding.nominal == 0 < sliding.step
+    assert all(value > 0 for value, in world.far(world.candidate("contact_friction", "box"), []))
+
+
+def test_moments_that_did_not_show_move_along_in_the_file():
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator=TWO_AXES)))
+    inertia = world.candidate("inertia", "a")
+    x, y, z = inertia.nominal
+    assert inertia.effect.possible((x, 1.5 * y, z), inertia.nominal) and not inertia.effect.possible((1.01 * x, 1.5 * y, 1.01 * z), inertia.nominal)
+    for values in ((x, 1.5 * y, z), (1.01 * x, 1.5 * y, 1.01 * z)):
+        moments = corrected(world, "inertia", "a", *values)[0].body("a").inertia
+        assert moments[1] == pytest.approx(1.5 * y) and 2 * moments.max() <= moments.sum()
+    assert same_motion(world, {inertia: (x, 1.5 * y, z)}, [0.3, -0.2], [0.5, 0.0]) < 1e-6
+
+
+def test_a_dead_zone_beside_a_total_mass():
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator=TWO_AXES).replace("<option", '<compiler settotalmass="3"/><option')))
+    model, form = corrected(world, "dead_zone", "m", 0.1)
+    assert form == "mjcf" and model.body("a").mass + model.body("b").mass == pytest.approx(3.0)
+
+
+def test_effects_where_a_motor_turns_a_free_body():
+    thrust = '<actuator><motor name="up" joint="f" gear="0 0 1 0 0 0"/><position name="p" joint="f" gear="0 0 1 0 0 0" kp="3"/></actuator></mujoco>'
+    world = World(mujoco.MjSpec.from_string(BOX.format(0.002, 0.5).replace("</mujoco>", thrust)))
+    own = [c for c in world.candidates if c.place.kind == "actuator"]
+    assert all(np.isfinite([p.low, p.step]).all() and p.step for c in own for p in c.parameters)
+    assert ("dead_zone", "p") not in {(c.effect.name, c.place.name) for c in own}
+    assert corrected(world, "dead_zone", "up", 0.1)[1] == "none"
+
+
+def test_a_muscles_joint_is_not_given_another_zero():
+    muscle = 'muscle name="m" lengthrange="-1 1"'
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator=muscle)))
+    assert corrected(world, "sensor_bias", "k", 0.05)[1] == "measurement"
+    assert corrected(world, "sensor_bias", "j", 0.05)[1] == "mjcf"
+
+
+# ---- holes and constants -----------------------------------------------------------------------
+
+
+def tumbling(rows=300, seed=0):
+    """A free body that turns about all axes: model, Recording with noise of 1 mm and 2 mrad."""
+    model = mujoco.MjModel.from_xml_string(BOX.format(0.002, 0.5).replace('pos="0 0 .1"', 'pos="0 0 9"'))
+    data, rng, qpos = mujoco.MjData(model), np.random.default_rng(seed), np.empty((rows, 7))
+    data.qvel[:] = 0.3, 0.2, 1.0, 2.0, 1.0, -1.5
+    for t in range(rows):
+        qpos[t] = data.qpos
+        mujoco.mj_integratePos(model, qpos[t], rng.normal(size=6) * np.repeat([1e-3, 2e-3], 3), 1.0)
+        mujoco.mj_step(model, data, 2)
+    return model, recordings.Recording("run", 0.004 * np.arange(rows), qpos, np.full((rows, 6), np.nan), np.zeros((rows, 0)))
+
+
+def test_a_lost_rotation_does_not_silence_the_others():
+    model, run = tumbling()
+    run.qpos[[0, 40], 3:] = np.nan
+    noise = cut.measurement_noise(model, [run])[0]
+    np.testing.assert_allclose(noise, np.repeat([1e-3, 2e-3], 3), rtol=0.3)
+
+
+def test_a_component_that_stands_still_does_not_silence_its_channel():
+    model, run = tumbling()
+    run.qpos[:, 2] = 0.1
+    np.testing.assert_allclose(cut.measurement_noise(model, [run])[0], np.repeat([1e-3, 2e-3], 3), rtol=0.3)
+
+
+def test_a_hole_across_which_the_quaternion_turns_its_sign():
+    model, run = tumbling()
+    whole = cut.states(model, run)
+    run.qpos[100:110, 3:] = np.nan
+    run.qpos[110:, 3:] *= -1
+    qpos, qvel = cut.states(model, run)
+    assert np.abs(cut.difference(model, whole[0], qpos)).max() < 0.02
+    assert np.abs((whole[1] - qvel)[[99, 110], 3:]).max() < 1.0
+
+
+def test_a_joint_read_once_is_a_joint_that_was_not_measured():
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator=TWO_AXES)))
+    time = np.arange(300) * 0.01
+    qpos = np.stack([0.3 * np.sin(2 * time), np.full(300, np.nan)], 1)
+    qpos[0, 1] = 0.2
+    run = recordings.Recording("run", time, qpos, np.full((300, 2), np.nan), np.zeros((300, 1)))
+    assert {o.candidate.place.name for o in scan.options_of(world, [run]) if o.candidate.effect.name == "stribeck_friction"} == {"j"}
+    problem = misfit.Problem(world, cut.consecutive(run, 0.3), np.array([1e-3, np.inf]), np.full(2, np.inf))
+    assert (problem.taken == 2).all() and scan.freedom(problem) == problem.rows - 2 * len(problem.windows)
+
+
+def test_an_offset_and_an_unnamed_force_in_a_joint_with_a_spring():
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint='stiffness="2" springref="10"', actuator=TWO_AXES)))
+    curve = world.curve("j", "position:j", np.linspace(-1, 1, 9))
+    setting = {world.candidate("spring_offset", "j"): (0.4,), curve: tuple(-1.5 * np.linspace(-1, 1, 9))}
+    assert set(world.corrected_xml(setting)[1].values()) == {"mjcf"}
+    assert same_motion(world, setting, [0.1, 0.2], [0.0, 0.0]) < 1e-3
