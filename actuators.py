@@ -128,7 +128,7 @@ class BackEmf(ActuatorEffect):
 
 @catalogue
 class Saturation(ActuatorEffect):
-    """The force is cut off at ± forcerange."""
+    """The force is cut off at ± forcerange (of a range that is not symmetric: its larger end)."""
     name, related = 'saturation', ('gain',)
 
     def parameters(self, model, i):
@@ -140,13 +140,19 @@ class Saturation(ActuatorEffect):
         used = self.forces(model, i, recordings).max()
         return used * np.array([[0.9], [0.7], [0.5], [0.3], [0.1]]) if used > 0 else np.zeros((0, 1))
 
+    @staticmethod
+    def limits(model, i, value):
+        """The range: where there is one already, that in proportion."""
+        nominal = model.actuator_forcerange[i] if model.actuator_forcelimited[i] else np.array([-1.0, 1.0])
+        return nominal * value / abs(nominal).max()
+
     def edit(self, model, i, values):
+        model.actuator_forcerange[i] = self.limits(model, i, values[0])
         model.actuator_forcelimited[i] = True
-        model.actuator_forcerange[i] = -values[0], values[0]
 
     def write(self, spec, model, i, values):
         actuator = spec.actuator(model.actuator(i).name)
-        actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-values[0], values[0]]
+        actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, self.limits(model, i, values[0])
         return 'mjcf'
 
 

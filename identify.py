@@ -228,7 +228,8 @@ def follows(problem, fit, share_allowed):
     with warnings.catch_warnings(action="ignore"):  # what was never measured has no spread
         moved = np.nanstd(cut.difference(problem.model, problem.measured_qpos[:, :1], problem.measured_qpos), axis=1)
     share = np.sqrt((gap[..., :problem.model.nv] ** 2).mean(1)) / np.maximum(moved, 1e-12)
-    return bool(np.nanmedian(share) < share_allowed)
+    known = (weight[..., :problem.model.nv] > 0).any(1)
+    return bool(np.median(share[known] if known.any() else 0.0) < share_allowed)
 
 
 def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at_least=0.0):

@@ -228,6 +228,13 @@ def test_a_dead_zone_beside_a_total_mass():
     assert form == "mjcf" and model.body("a").mass + model.body("b").mass == pytest.approx(3.0)
 
 
+def test_a_force_range_that_is_not_symmetric_keeps_its_shape():
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator='motor name="m" forcerange="-1 2"')))
+    assert world.candidate("saturation", "m").nominal == (2.0,)
+    np.testing.assert_allclose(corrected(world, "saturation", "m", 0.5)[0].actuator_forcerange[0], [-0.25, 0.5])
+    assert same_motion(world, {world.candidate("saturation", "m"): (0.2,)}, [0.3, -0.2], [0.5, 0.0]) < 1e-6
+
+
 def test_effects_where_a_motor_turns_a_free_body():
     thrust = '<actuator><motor name="up" joint="f" gear="0 0 1 0 0 0"/><position name="p" joint="f" gear="0 0 1 0 0 0" kp="3"/></actuator></mujoco>'
     world = World(mujoco.MjSpec.from_string(BOX.format(0.002, 0.5).replace("</mujoco>", thrust)))
