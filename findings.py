@@ -18,6 +18,7 @@ from effects import JOINT_TRANSMISSIONS
 
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
 NEAR = 0.3  # so near they have to come before they are refitted
+WIDER = 1.3  # for what clusters do not show: without it 88 % of the intervals of 400 trials (seed 161803) held the truth, with it 93 %
 # of an unknown force's largest: up to which it counts as none, up to which its interval must lie outside its region;
 # of the recorded range: a region that covers more is no part of it
 FAINT, SMALL, PART = 0.25, 0.4, 0.75
@@ -45,7 +46,7 @@ def intervals(search, fit):
     gram, score = scores.summed(search.labels, scan.gram), scores.summed(search.labels, scan.score)
     seen = np.flatnonzero(np.diag(gram.sum(0))[:-1] > shooting.UNSEEN)
     half, shift = np.full(len(moves), np.inf), np.zeros(len(moves))
-    half[seen] = np.abs(moves[seen]) * spread(gram, score, seen, np.zeros(len(seen)))  # at the optimum scores are leftovers
+    half[seen] = WIDER * np.abs(moves[seen]) * spread(gram, score, seen, np.zeros(len(seen)))  # at the optimum scores are leftovers
     # as far as ever smaller steps would move the values, which is twice as far as half a step, if so much of it is in the data
     every = np.append(seen, -1)
     amounts = scores.solve_small(gram.sum(0)[np.ix_(every, every)], score.sum(0)[every])
