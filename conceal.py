@@ -19,7 +19,7 @@ from hidden import Real
 from mechanisms import MECHANISMS, UNKNOWNS
 
 DEVELOPMENT_SEEDS = range(1, 1000)                   # for looking at, and improving the method on
-FINAL_SEED = 271828             # of the table to publish next: run once, while the method stands still
+FINAL_SEED = 314159             # of the table to publish next: run once, while the method stands still
 SIZES = (0.03, 0.1, 0.3)
 NOISES = (0.0003, 0.001)                             # rad or m per reading
 BLOCK = ("null",) * 13 + ("single",) * 24 + ("pair",) * 8 + ("unknown",) * 5

@@ -167,6 +167,17 @@ class Real:
 
     # motion
 
+    def behind(self, qpos, qvel):
+        """The state that its sensors would report as this, but for their delay."""
+        qpos, qvel = np.array(qpos), np.array(qvel)
+        for item in self.hidden[::-1]:
+            if item["effect"] == "sensor_bias":
+                qpos[self._joint(item).qposadr[0]] -= item["parameters"]["offset"]
+            elif item["effect"] == "sensor_scale":
+                qpos[self._joint(item).qposadr[0]] /= item["parameters"]["ratio"]
+                qvel[self._dof(item)] /= item["parameters"]["ratio"]
+        return qpos, qvel
+
     def advance(self, ctrl, seconds, event=False):
         """Hold `ctrl` (nu,) for `seconds`. event: effects that come and go are there."""
         self.event = event

@@ -32,14 +32,14 @@ def wilson(hits, trials, z=1.96):
     return float(max(0.0, centre - half)), float(min(1.0, centre + half))
 
 
-def parse(row):
-    """A row of the table with its JSON and numbers read; trials without a diagnosis found nothing."""
+def parse(row, seals):
+    """A row of the table with its JSON and numbers read; trials without a diagnosis found nothing. seals: as prove.published gives."""
     number = lambda key: float(row[key]) if row[key] else float("nan")
     answer = json.loads(row["answer"])
     return {**row, "answer": answer, "hidden": answer["hidden"], "moved": json.loads(row["over_noise"]),
             "findings": json.loads(row["findings"] or "[]"), "parameters": json.loads(row["parameters"] or "[]"),
             "found": int(row["found"] or 0), "first": int(row["first"] or 0), "extras": int(row["extras"] or 0),
-            "finer": int(row["finer"]), "sealed": seal(row["answer"], row["salt"]) == row["commitment"],
+            "finer": int(row["finer"]), "sealed": seal(row["answer"], row["salt"]) == row["commitment"] and row["commitment"] in seals.get((row["seed"], row["trial"]), ()),
             **{key: number(key) for key in ("seconds", "cpu_seconds", "error_before", "error_after", "error_floor",
                                             "reported_before", "reported_after", "remeasured_after")}}
 
@@ -57,7 +57,8 @@ def rates(rows):
     intervals = [(r, p) for r in rows for p in r["parameters"] if p["low"] is not None and p["high"] is not None]
     held = lambda chosen: (sum(p["low"] <= p["truth"] <= p["high"] for _, p in chosen), len(chosen))
     formed = [(r, p) for r, p in intervals if p["effect"] not in FORMLESS]
-    deviations = [deviation(p) for r in strong for p in r["parameters"]]
+    estimates = [p for r in strong for p in r["parameters"]]
+    changes = [p for p in estimates if np.isfinite(p["nominal"]) and p["nominal"] != p["truth"]]
     named = [r for r in single if r["answer"]["sizes"] == [0.0]]
     count = lambda chosen, test: (sum(map(test, chosen)), len(chosen))
     return [
@@ -71,7 +72,7 @@ def rates(rows):
          *count(literal, lambda r: r["found"] == 1)),
         ("one effect that moves prediction by less: a wrong name",
          *count([r for r in single if min(r["moved"]) <= 1], lambda r: r["extras"] > 0)),
-        ("nothing hidden: a false alarm", *count(null, lambda r: r["extras"] > 0)),
+        ("nothing hidden: a false alarm, or no diagnosis", *count(null, lambda r: r["extras"] > 0 or r["exit"] != "0")),
         ("two effects, each > 1 x noise: both named or among the possible",
          *count(strong_pairs, lambda r: r["found"] == 2)),
         ("… both by first name", *count(strong_pairs, lambda r: r["first"] == 2)),
@@ -81,7 +82,9 @@ def rates(rows):
         ("… called by a catalogue name instead, unknown not among the possible",
          *count(unknown, confidently_wrong)),
         ("parameters within 5 % (first name right, effect > 1 x noise)",
-         sum(d <= 0.05 for d in deviations), len(deviations)),
+         *count(estimates, lambda p: deviation(p) <= 0.05)),
+        ("… within 5 % of their change from a finite nominal value",
+         *count(changes, lambda p: abs(p["value"] - p["truth"]) <= 0.05 * abs(p["truth"] - p["nominal"]))),
         ("95 % intervals hold the truth: all", *held(intervals)),
         ("… where the truth has the model's form", *held(formed)),
         ("… and its time step", *held([(r, p) for r, p in formed if r["finer"] == 1])),
@@ -89,13 +92,13 @@ def rates(rows):
         ("Hopper torso +27 %, HalfCheetah torso +15 %, pendulum pole 100: named",
          *count(named, lambda r: r["found"] == 1)),
         ("error of corrected.xml in stock MuJoCo within 2 % of the reported one (all findings in MJCF)",
-         *count([r for r in diagnosed if all(f.get("written_as", "mjcf") == "mjcf" for f in r["findings"])], agrees)),
+         *count([r for r in diagnosed if r["findings"] and all(f.get("written_as", "mjcf") == "mjcf" for f in r["findings"])], agrees)),
     ]
 
 
 def deviation(p):
-    """Relative to the true value, or to the change from the nominal where that is larger."""
-    return abs(p["value"] - p["truth"]) / max(abs(p["truth"]), abs(p["truth"] - (p["nominal"] or 0.0)), 1e-12)
+    """Relative to the true value, to the change from the nominal or, of a vector, to its size, where that is larger."""
+    return abs(p["value"] - p["truth"]) / max(abs(p["truth"]), abs(p["truth"] - (p["nominal"] or 0.0)), p.get("size", 0.0), 1e-12)
 
 
 def confidently_wrong(row):
@@ -220,9 +223,11 @@ def lines(rows):
             for what, hits, trials in rates(rows)]
 
 
-def write(table, out):
-    """Write the page of a table (rows as prove.read gives them) to `out`, whole."""
-    rows = [parse(row) for row in table]
+def write(table, seals, out):
+    """Write the page of a table (rows as prove.read, seals as prove.published gives them) to `out`, whole."""
+    rows = [parse(row, seals) for row in table]
+    without = len(set(seals) - {(row["seed"], row["trial"]) for row in rows})
+    twice = sum(len(found) > 1 for found in seals.values())
     kinds = Counter(row["kind"] for row in rows)
     seconds = np.array([row["cpu_seconds"] for row in rows])
     worst = [(r["trial"], r["mechanism"], "finer" if r["finer"] > 1 else "same",
@@ -234,7 +239,8 @@ def write(table, out):
         "<h1>Sealed blind trials of the diagnosis</h1>",
         f"<p>{len(rows)} trials, seed {', '.join(sorted({row['seed'] for row in rows}))}: "
         + ", ".join(f"{n} {kind}" for kind, n in kinds.items())
-        + f". CPU seconds of a diagnosis: median {np.median(seconds):.1f}, longest {seconds.max():.1f}.</p>",
+        + f". CPU seconds of a diagnosis: median {np.median(seconds):.1f}, longest {seconds.max():.1f}. "
+        f"Sealed but not in the table: {without}; broken off and sealed again: {twice}.</p>",
         _table(("rate", "hits / trials", "", "95 % Wilson interval"), lines(rows)),
         "<h2>Detection against size</h2>", _detection_figure(rows),
         "<h2>What was hidden, what was said first</h2>", _confusion_figure(rows),

@@ -2,6 +2,7 @@
 
     python prove.py run --seed 1 --trials 40 --out results/proof_dev.csv
     python prove.py show --seed 1 --trial 15 --folder /tmp/t15       # draw a development trial again
+    python prove.py score results/proof.csv                          # again, by the present rules
     python prove.py page results/proof.csv --out results/proof.html
 
 A trial is concealed here (conceal.py); SHA-256 of answer and salt goes to OUT.sealed; then
@@ -138,10 +139,10 @@ def hand_error(real, runs, noise, perfect):
     nominal, differences = real.model, []
     for run in runs:
         if perfect:
-            real.reset(run.true_qpos[0], run.true_qvel[0])
+            real.reset(*real.behind(run.true_qpos[0], run.true_qvel[0]))
         for first, last in windows(run.time):
             if perfect:
-                real.put(run.true_qpos[first], run.true_qvel[first])
+                real.put(*real.behind(run.true_qpos[first], run.true_qvel[first]))
             else:
                 real.restore(run.states[first])
                 qpos, qvel = real.seen()
@@ -194,8 +195,8 @@ def right(finding, item):
         return (item["effect"], item["place"]["kind"], item["place"]["name"]) in names(finding)
     if ("unknown", "joint", item["place"]["name"]) not in names(finding):
         return False
-    wanted = DEPENDS_ON[item["effect"]]
-    return any(variable.split(":")[0] in wanted for variable in finding.get("depends_on", []))
+    parts = [variable.partition(":") for variable in finding.get("depends_on", [])]
+    return set(DEPENDS_ON[item["effect"]]) <= {kind for kind, _, name in parts if kind in ("time", "control") or name == item["place"]["name"]}
 
 
 def score(answer, findings):
@@ -209,7 +210,8 @@ def score(answer, findings):
 
 
 def compare_parameters(answer, findings, runs):
-    """[{name, truth, value, low, high}] of each right first name; components that move nothing are left out."""
+    """[{effect, name, truth, size, nominal, value, low, high}] of each right first name; components that move nothing are left
+    out. size: of a vector, how far all of it lies from the nominal one."""
     rows = []
     for index, item in enumerate(answer["hidden"]):
         finding = next((f for f in findings if right(f | {"also_possible": []}, item)), None)
@@ -219,18 +221,19 @@ def compare_parameters(answer, findings, runs):
         wanted = PARAMETERS.get(item["effect"]) or list(item["parameters"])[:1]
         for name in wanted:
             match = reported if len(wanted) == 1 else [p for p in reported if p["name"] == name]
-            if not match or item["effect"] in VECTORS and _still(answer, index, name, match[0], runs):
+            size = float(np.linalg.norm([item["parameters"][p["name"]] - p["nominal"] for p in reported])) if item["effect"] in VECTORS else 0.0
+            if not match or size and _still(answer, index, name, size, runs):
                 continue
             more = match[0]["nominal"] if item["effect"] == "back_emf" else 0.0  # it was hidden beside what a servo has of it
-            rows.append({"effect": item["effect"], "name": name, "truth": item["parameters"][name] + more,
+            rows.append({"effect": item["effect"], "name": name, "truth": item["parameters"][name] + more, "size": size,
                          **{key: match[0].get(key) for key in ("nominal", "value", "low", "high")}})
     return rows
 
 
-def _still(answer, index, component, reported, runs):
-    """True where this component of a hidden vector moves predictions by less than the noise."""
+def _still(answer, index, component, size, runs):
+    """True where this component of a hidden vector, changed by the size of the whole, moves predictions by less than the noise."""
     item = answer["hidden"][index]
-    changed = item | {"parameters": item["parameters"] | {component: reported["nominal"] or 0.0}}
+    changed = item | {"parameters": item["parameters"] | {component: item["parameters"][component] + size}}
     rest = [changed if k == index else other for k, other in enumerate(answer["hidden"])]
     real = Real(MECHANISMS[answer["mechanism"]], rest, answer["finer"])
     return hand_error(real, runs, answer["noise"], True) < 1.0
@@ -247,34 +250,64 @@ def run_trial(seed, number, sealed):
         return reveal(trial, folder / "report", seed, number, diagnose(trial.command, folder))
 
 
+def scoring_runs(trial):
+    """(held-out Runs, those in which something comes and goes)."""
+    return ([run for name, run in trial.runs.items() if name.startswith("held_out")],
+            [run for run in trial.runs.values() if run.event.any()])
+
+
+def sizes(trial):
+    """How far each hidden item moves predictions, in units of noise."""
+    answer, (held_out, events) = json.loads(trial.answer), scoring_runs(trial)
+    return [round(over_noise(answer, events if item["parameters"].get("event") else held_out, {index}), 4)
+            for index, item in enumerate(answer["hidden"])]
+
+
 def reveal(trial, report, seed, number, done):
     """Check the seal, score the report against the answer. done: what `diagnose` returned. Returns the row."""
     if seal(trial.answer, trial.salt) != trial.commitment:
         raise ValueError(f"trial {number} of seed {seed}: the answer is not the one that was sealed")
     answer = json.loads(trial.answer)
-    held_out = [run for name, run in trial.runs.items() if name.startswith("held_out")]
-    events = [run for run in trial.runs.values() if run.event.any()]
+    held_out, events = scoring_runs(trial)
     nominal = MECHANISMS[answer["mechanism"]].spec().compile()
-    moved = [over_noise(answer, events if item["parameters"].get("event") else held_out, {index})
-             for index, item in enumerate(answer["hidden"])]
     row = {"seed": seed, "trial": number, "commitment": trial.commitment, "salt": trial.salt,
            "answer": trial.answer, "kind": answer["kind"], "mechanism": answer["mechanism"],
-           "noise": answer["noise"], "finer": answer["finer"], "over_noise": json.dumps([round(m, 4) for m in moved]),
+           "noise": answer["noise"], "finer": answer["finer"], "over_noise": json.dumps(sizes(trial)),
            **done,
            "error_before": stock_error(nominal, nominal, held_out, answer["noise"]),
            "error_floor": hand_error(Real(MECHANISMS[answer["mechanism"]], answer["hidden"], answer["finer"]),
                                      held_out, answer["noise"], False)}
-    if done["exit"] == 0:
-        summary = json.loads((report / "diagnosis.json").read_text())
-        findings = summary["findings"]
-        corrected = mujoco.MjModel.from_xml_path(str(report / "corrected.xml"))
-        fit = summary["fit"]["held_out"]
-        row |= {"verdict": summary["verdict"], "findings": json.dumps(findings), **score(answer, findings),
-                "parameters": json.dumps(compare_parameters(answer, findings, events or held_out)),
-                "error_after": stock_error(nominal, corrected, held_out, answer["noise"]),
-                "reported_before": fit["before"], "reported_after": fit["after"],
-                "remeasured_after": stock_error(nominal, corrected, held_out, dof_noise(nominal, summary["noise"]))}
+    try:
+        row |= scored(trial, report, nominal) if done["exit"] == 0 else {}
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:  # the report's fault: it counts as no diagnosis
+        row |= {"exit": 1, "note": f"the report cannot be scored: {type(error).__name__} {error}"[:300]}
     return {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
+
+
+def scored(trial, report, nominal):
+    """The columns of a row that say what a report is worth."""
+    summary, (held_out, _) = json.loads((report / "diagnosis.json").read_text()), scoring_runs(trial)
+    corrected = mujoco.MjModel.from_xml_path(str(report / "corrected.xml"))
+    fit = summary["fit"]["held_out"]
+    return {"verdict": summary["verdict"], "findings": json.dumps(summary["findings"]), **judged(trial, summary["findings"]),
+            "error_after": stock_error(nominal, corrected, held_out, json.loads(trial.answer)["noise"]),
+            "reported_before": fit["before"], "reported_after": fit["after"],
+            "remeasured_after": stock_error(nominal, corrected, held_out, dof_noise(nominal, summary["noise"]))}
+
+
+def judged(trial, findings):
+    """Of those, what the findings alone decide."""
+    answer, (held_out, events) = json.loads(trial.answer), scoring_runs(trial)
+    return {**score(answer, findings), "parameters": json.dumps(compare_parameters(answer, findings, events or held_out))}
+
+
+def again(row):
+    """A row scored again by these rules, its trial drawn again. Raises ValueError where that gives another answer than was sealed."""
+    with tempfile.TemporaryDirectory() as folder:
+        trial = conceal(int(row["seed"]), int(row["trial"]), Path(folder))
+    if trial.answer != row["answer"]:
+        raise ValueError(f"trial {row['trial']} of seed {row['seed']}: drawn again, the answer is not the one that was sealed")
+    return {**row, "over_noise": json.dumps(sizes(trial)), **(judged(trial, json.loads(row["findings"])) if row["exit"] == "0" else {})}
 
 
 # the table
@@ -286,6 +319,15 @@ def read(path):
         return []
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
+
+
+def published(path):
+    """{(seed, trial): [commitment, ...]} of the seals beside a table: more than one where a trial was broken off and run again."""
+    seals = {}
+    for line in Path(f"{path}.sealed").read_text().splitlines():
+        seed, trial, commitment = line.split()
+        seals.setdefault((seed, trial), []).append(commitment)
+    return seals
 
 
 def write(path, rows):
@@ -337,6 +379,8 @@ def main():
     command.add_argument("--seed", type=int, required=True)
     command.add_argument("--trial", type=int, required=True)
     command.add_argument("--folder", required=True, help="made, and filled")
+    command = commands.add_parser("score", help="draw every trial of a table again, and score its findings by the present rules")
+    command.add_argument("table")
     command = commands.add_parser("page", help="make the page of figures from a table")
     command.add_argument("table")
     command.add_argument("--out", required=True)
@@ -348,10 +392,14 @@ def main():
         folder.mkdir(parents=True, exist_ok=True)
         trial = conceal(arguments.seed, arguments.trial, folder)
         print(f"cd {folder} && python {ROOT / 'diagnose.py'}", *trial.command, "--out report\n" + trial.answer)
+    elif arguments.command == "score":
+        with ProcessPoolExecutor(cores()) as pool:
+            write(arguments.table, list(tqdm(pool.map(again, read(arguments.table)), disable=not sys.stderr.isatty())))
     else:
         import proof_page
-        proof_page.write(read(arguments.table), arguments.out)
-        for line in proof_page.lines([proof_page.parse(row) for row in read(arguments.table)]):
+        rows, seals = read(arguments.table), published(arguments.table)
+        proof_page.write(rows, seals, arguments.out)
+        for line in proof_page.lines([proof_page.parse(row, seals) for row in rows]):
             print("{:100s} {:>9s} {:>8s}  {}".format(*line))
 
 

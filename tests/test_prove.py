@@ -321,6 +321,9 @@ def answer(*hidden, finer=1):
     (answer(ELBOW), [finding(hide("coulomb_friction", "joint", "shoulder"))], 0, 0, 1),
     (answer(hide("detent", "joint", "elbow")), [finding(hide("unknown", "joint", "elbow"), depends_on=["position:elbow"])], 1, 1, 0),
     (answer(hide("detent", "joint", "elbow")), [finding(hide("unknown", "joint", "elbow"), depends_on=["time"])], 0, 0, 1),
+    (answer(hide("detent", "joint", "elbow")), [finding(hide("unknown", "joint", "elbow"), depends_on=["position:wrist"])], 0, 0, 1),
+    (answer(hide("friction_patch", "joint", "elbow")), [finding(hide("unknown", "joint", "elbow"), depends_on=["velocity:elbow"])], 0, 0, 1),
+    (answer(hide("fading_gain", "joint", "elbow")), [finding(hide("unknown", "joint", "elbow"), depends_on=["time", "control:m"])], 1, 1, 0),
     (answer(hide("detent", "joint", "elbow")), [finding(hide("cogging", "joint", "elbow"))], 0, 0, 1),
 ])
 def test_score(truth, findings, found, first, extras):
@@ -400,13 +403,40 @@ def test_run_resumes_and_the_page_is_whole(tmp_path, monkeypatch):
     assert sorted(asked) == [0, 1, 2, 3, 4, 5]
     table = prove.read(out)
     assert [int(row["trial"]) for row in table] == list(range(6))
-    proof_page.write(table, tmp_path / "proof.html")
+    (tmp_path / "results" / "proof.csv.sealed").write_text("".join(f"3 {row['trial']} {row['commitment']}\n" for row in table[:5]) + "3 9 ab\n")
+    proof_page.write(table, prove.published(out), tmp_path / "proof.html")
     page = (tmp_path / "proof.html").read_text()
+    assert "Sealed but not in the table: 1; broken off and sealed again: 0" in page and "5/6" in page  # one row's seal was never published
     assert page.endswith("</html>") and "0/6" in page and "http" not in page.replace("http://www.w3.org", "")
 
 
 def test_final_seed_is_no_development_seed():
     assert conceal.FINAL_SEED not in conceal.DEVELOPMENT_SEEDS
+
+
+def test_a_report_that_cannot_be_scored_counts_as_no_diagnosis(tmp_path):
+    trial = conceal.conceal(1, 59, tmp_path)
+    row = prove.reveal(trial, tmp_path / "nowhere", 1, 59, {"exit": 0, "seconds": 1.0, "cpu_seconds": 1.0, "note": ""})
+    assert row["exit"] == 1 and "cannot be scored" in row["note"] and json.loads(row["over_noise"])[0] > 1
+
+
+def test_a_row_is_scored_again_and_its_answer_drawn_again(tmp_path):
+    trial = conceal.conceal(1, 59, tmp_path)
+    [hidden] = json.loads(trial.answer)["hidden"]
+    row = {"seed": "1", "trial": "59", "answer": trial.answer, "exit": "0", "findings": json.dumps([finding(hidden)]), "found": 0}
+    assert prove.again(row)["found"] == 1
+    with pytest.raises(ValueError, match="not the one that was sealed"):
+        prove.again(row | {"answer": trial.answer.replace("coulomb", "viscous")})
+
+
+def test_an_effect_beside_a_biased_sensor_is_as_large_as_alone():
+    arm = conceal.MECHANISMS["arm2"]
+    bias = hide("sensor_bias", "joint", "elbow", offset=0.05)
+    nothing, both = (Real(arm, items, finer=1) for items in ([bias], [bias, hide("armature", "joint", "shoulder", armature=1e-9)]))
+    qpos, qvel = np.array([0.3, -0.2]), np.array([0.5, 0.1])
+    for real in (nothing, both):
+        real.reset(*real.behind(qpos, qvel))
+        np.testing.assert_allclose(real.reading(), (qpos, qvel), atol=1e-12)
 
 
 # whole trials, diagnosed
