@@ -58,7 +58,7 @@ def rates(rows):
     held = lambda chosen: (sum(p["low"] <= p["truth"] <= p["high"] for _, p in chosen), len(chosen))
     formed = [(r, p) for r, p in intervals if p["effect"] not in FORMLESS]
     estimates = [p for r in strong for p in r["parameters"]]
-    changes = [p for p in estimates if np.isfinite(p["nominal"]) and p["nominal"] != p["truth"]]
+    changes = [p for p in estimates if p["nominal"] not in (None, p["truth"])]  # None: a limit that the model does not have
     named = [r for r in single if r["answer"]["sizes"] == [0.0]]
     count = lambda chosen, test: (sum(map(test, chosen)), len(chosen))
     return [
