@@ -166,10 +166,11 @@ def _csv(path, data, model):
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     above, first, body = _header_line(text)
     try:
-        header = next(csv.reader([first], strict=True, skipinitialspace=True), [])
+        header = [cell.strip() for cell in next(csv.reader([first], strict=True), [])]
+        header = [cell[1:-1] if len(cell) > 1 and cell[0] == cell[-1] == '"' else cell for cell in header]  # quoted after a space
     except csv.Error as error:
         raise RecordingError(f"{path}: row {above + 1}: the header cannot be read ({error}); write plain column names") from None
-    if "time" not in [cell.strip() for cell in header]:
+    if "time" not in header:
         for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars"), (" ", "spaces")):
             if "time" in [cell.strip(' "') for cell in first.split(mark)]:
                 raise RecordingError(f"{path}: row {above + 1}: columns are separated by {name}; separate them by commas")

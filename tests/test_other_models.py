@@ -123,6 +123,14 @@ def test_the_last_row_needs_no_control(tmp_path):
         recordings.load([csv(tmp_path / "run.csv", rows)], model)
 
 
+def test_a_header_quoted_after_spaces(tmp_path):
+    path = csv(tmp_path / "run.csv", [(t, np.sin(t), np.sin(2 * t), 0.0) for t in np.arange(100) * 0.01])
+    text = (tmp_path / "run.csv").read_text().replace("time,qpos:j,qpos:k,ctrl:pull", '"time", "qpos:j", "qpos:k", "ctrl:pull"')
+    (tmp_path / "run.csv").write_text(text)
+    [run] = recordings.load([path], mujoco.MjModel.from_xml_string(PENDULUM))
+    assert run.qpos[50, 1] == pytest.approx(np.sin(1.0))
+
+
 def test_recordings_to_fit_that_stand_still(tmp_path, capfd):
     (tmp_path / "model.xml").write_text(PENDULUM)
     time = np.arange(300) * 0.01
