@@ -165,8 +165,6 @@ class Real:
                 qvel[dof] = np.interp(then, past[:, 0], past[:, 2])
         return qpos, qvel
 
-    # motion
-
     def behind(self, qpos, qvel):
         """The state that its sensors would report as this, but for their delay."""
         qpos, qvel = np.array(qpos), np.array(qvel)
@@ -177,6 +175,8 @@ class Real:
                 qpos[self._joint(item).qposadr[0]] /= item["parameters"]["ratio"]
                 qvel[self._dof(item)] /= item["parameters"]["ratio"]
         return qpos, qvel
+
+    # motion
 
     def advance(self, ctrl, seconds, event=False):
         """Hold `ctrl` (nu,) for `seconds`. event: effects that come and go are there."""

@@ -268,7 +268,7 @@ def reveal(trial, report, seed, number, done):
     if seal(trial.answer, trial.salt) != trial.commitment:
         raise ValueError(f"trial {number} of seed {seed}: the answer is not the one that was sealed")
     answer = json.loads(trial.answer)
-    held_out, events = scoring_runs(trial)
+    held_out, _ = scoring_runs(trial)
     nominal = MECHANISMS[answer["mechanism"]].spec().compile()
     row = {"seed": seed, "trial": number, "commitment": trial.commitment, "salt": trial.salt,
            "answer": trial.answer, "kind": answer["kind"], "mechanism": answer["mechanism"],

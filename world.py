@@ -220,7 +220,8 @@ class World:
                     moved = its.qpos0 - mine.qpos0 if mine.type[0] in (HINGE, SLIDE) else 0.0
                     place[its.qposadr[0]:its.qposadr[0] + width] = old[mine.qposadr[0]:mine.qposadr[0] + width] + moved
                 key.qpos = place
-            spec.compile()
+            if spec.keys:
+                spec.compile()
             return spec.to_xml(), written
 
 
