@@ -27,7 +27,7 @@ def earned(search, fit, windows, position_noise):
     while fit.hypothesis.effects:
         candidates = fit.hypothesis.candidates
         before, after = (error(s) for s in ([{}] * len(windows), elsewhere(search, fit, windows)))
-        far = search.leaves_much(fit)
+        far = is_far(search, fit)
         rise, bound, _ = scatter(windows, before, after)
         harm = overall(after) > (1 + WORSE) * overall(before) and (far or rise >= bound)
         if harm:  # what only stands in for something else goes first
@@ -51,11 +51,16 @@ def doubt(search, fit, windows, candidate, after, less):
     gain, bound, whole = scatter(windows, after, less)
     if not gain:  # what no measured position sees, velocities may: it is not judged here
         kept = True
-    elif search.leaves_much(fit):
+    elif is_far(search, fit):
         kept = gain > max(bound, SLIGHT * whole) or overall(less) > (1 + SLIGHT) * overall(after)
     else:
         kept = gain > 0 or there(windows, after, less) or gain > -bound and search.significance(fit, candidate)[1] > PLAIN
     return None if kept else gain / max(bound, 1e-9)
+
+
+def is_far(search, fit):
+    """Whether a fit is so far from the noise that its effects may only stand in for others; not where it is jumps that keep it there."""
+    return search.leaves_much(fit) and not search.coarse
 
 
 def scatter(windows, one, other):

@@ -40,6 +40,7 @@ GROSS = 5.0  # residual of a window over the usual one, that it may count for
 MUCH, UNFOUND = 4.0, 0.05  # squared residual, over the noise's and the nominal model's, above which shorter windows are tried
 LONGER = 1.3  # times what the shortest windows leave, up to which rows far apart are followed
 UNLIKELY = 3.0  # standard deviations of the squared residual, that an event must spare
+MANY = 3  # effects, of which a few may be one in disguise
 ROUNDS, MORE = 3, 1.5  # of search, each with windows longer by this at least
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
@@ -68,7 +69,7 @@ def identify(world, train, held_out, progress=None):
     hypothesis = misfit.Hypothesis(tuple((c, c.effect.canonical(values)) for c, values in hypothesis.effects))
     say(0.8, "intervals")
     problem, fit = bounded(problem_of(*data, span, FINAL_STEPS), hypothesis)
-    final = selection.Search(world, problem, train)
+    final = selection.Search(world, problem, train, search.coarse)
     if hypothesis.effects:
         [fit] = shooting.solve(final.problem, [hypothesis], fit)
         fit = final.drop(shooting.renewed(final.problem, fit), ())
@@ -107,11 +108,14 @@ def searched(data, say):
         if much and kept:  # too long again
             search, fit, span = kept
             break
-        if much and not i:
+        nothing = not fit.hypothesis.effects and not scan.at_noise(search.problem, fit)
+        if (much or nothing) and not i:
             found = shorter(data, search, fit, span, say)
             # of what reaches the noise in short windows and not in long ones, the start states are wrong there
             kept = found if found[2] < span and found[1].chi2.sum() < selection.FAR * found[0].problem.rows else None
             search, fit, span = found
+        if not (i or fit.hypothesis.effects):
+            search, fit, span = further(data, search, fit, span, say)
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
     return search, fit, ranking, span
@@ -137,15 +141,45 @@ def shorter(data, search, fit, span, say):
     return search, fit, span
 
 
+def further(data, search, fit, span, say):
+    """(Search, Fit, span) of longer windows in which something is found and then nothing left, or as given.
+
+    Where rows are far apart, windows are kept as short as start states need them, and in those a small fault is not seen.
+    """
+    world, train = data[:2]
+    more_span, most = span, span_for(*data, fit.hypothesis, at_least=span, scatter=np.inf)
+    while more_span < most:
+        more_span = min(2 * more_span, most)
+        say(0.15, f"searching {len(world.candidates)} candidates in {more_span:.2g} s windows")
+        other, more, _ = sought(world, train, problem_of(*data, more_span, SEARCH_STEPS), misfit.Hypothesis())
+        if more.hypothesis.effects and more.chi2.sum() < selection.FAR * other.problem.rows:
+            return other, more, more_span
+    return search, fit, span
+
+
 def sought(world, train, problem, hypothesis):
-    """(Search, Fit, squared residual at the beginning) of what a problem's windows say, begun at a hypothesis."""
+    """(Search, Fit, squared residual at the beginning) of what a problem's windows say, begun at a hypothesis.
+
+    Where that leaves much, or takes many effects, once more from nothing: with nothing held back, and with larger steps. Where
+    something is met in one step of time or in the next predictions jump, and small steps see the jumps alone.
+    """
     problem, fit = bounded(problem, hypothesis)
     before = fit.chi2.sum()
     search = selection.Search(world, problem, train)
     if hypothesis.effects:
         [fit] = shooting.solve(problem, [hypothesis], fit)
         fit = search.drop(fit, ())
-    return search, search.run(fit), before
+    fit = search.run(fit)
+    nothing = not fit.hypothesis.effects and not scan.at_noise(problem, fit)
+    several = [c for c in fit.hypothesis.candidates if c.effect.name != "time_step"]
+    if nothing or search.leaves_much(fit) or len(several) >= MANY:
+        other = selection.Search(world, problem, train, coarse=True)
+        new = other.run(shooting.fit_starts(problem, misfit.Hypothesis()), late=True)
+        size = lambda f: len(f.hypothesis.parameters)
+        least_gain = -scan.WORTH if size(new) < size(fit) else search.worth(fit)
+        if new.hypothesis.effects and new.hypothesis.possible and new.chi2.sum() < (1 - least_gain) * fit.chi2.sum():
+            search, fit = other, new
+    return search, fit, before
 
 
 def bounded(problem, hypothesis):
@@ -232,12 +266,12 @@ def follows(problem, fit, share_allowed):
     return bool(np.median(share[known] if known.any() else 0.0) < share_allowed)
 
 
-def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at_least=0.0):
+def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at_least=0.0, scatter=LONGER):
     """The longest window span that the model with a hypothesis follows, from a few samples up.
 
     Up to LONGEST (or a few dozen rows) while the residual is a few noises; where recordings are far more precise than
     any model, longer windows only add nonlinearity, and half the reported horizon is enough. Where rows are far apart
-    start states soon end in local minima, and longer windows are to leave no more than the shortest.
+    start states soon end in local minima, and longer windows are to leave no more than `scatter` times what the shortest do.
     """
     sample = cut.sampling(train)
     duration = np.median([np.ptp(r.time) for r in train])
@@ -257,7 +291,7 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
         problem, fit = fitted(span)
         return follows(problem, fit, FOLLOWS_SHARE if span < 0.6 * cut.HORIZON else 0.0) and missed(problem, fit) < most
 
-    most = LONGER * missed(*fitted(shortest)) if observer.far_apart(train) else np.inf
+    most = scatter * missed(*fitted(shortest)) if observer.far_apart(train) else np.inf
     span = float(np.clip(cut.HORIZON / 2, shortest, longest))
     if followed(span):
         while span < longest and followed(min(2 * span, longest)):

@@ -8,7 +8,7 @@ Columns are differences of simulations, with start states and the fit's own para
 what is significant is measured between clusters of windows (scores).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,8 @@ import shooting
 WORTH, WORTH_MISFIT = 0.03, 0.1  # least fall of the squared residual that an effect must bring; where it is far above the noise
 FLEXIBLE = "inertia", "nonlinear_stiffness"  # with many ways to bend, they too come late
 PROMISING = 12  # options, at least, that are looked at anew after every addition
+COARSE = 10.0  # times the usual steps of parameters, where small ones see jumps alone
+NEARLY = 1.1  # squared residual over the noise's, up to which nothing need be left
 FEW = 16  # windows, at least, of a refit that only has to tell hypotheses apart
 
 
@@ -51,6 +53,11 @@ def freedom(problem):
     return max(problem.rows - problem.taken.sum(), 1)
 
 
+def at_noise(problem, fit):
+    """Whether a fit leaves hardly more than the noise does."""
+    return fit.chi2.sum() <= NEARLY * freedom(problem)
+
+
 def unseen(world, place, recordings):
     """Whether a place is a joint whose motion was never measured: nothing tells where its probes should lie."""
     if place.kind != "joint":
@@ -59,8 +66,8 @@ def unseen(world, place, recordings):
     return not any(np.isfinite(r.qpos[:, q]).sum() > 1 for r in recordings)
 
 
-def options_of(world, recordings):
-    """Every way to try every candidate. Effects with probes of their own have no gradient at their nominal value."""
+def options_of(world, recordings, coarse):
+    """Every way to try every candidate, with `coarse` times the usual steps. Effects with probes have no gradient at their nominal value."""
     out = []
     for candidate in world.candidates:
         if candidate.effect.timed or candidate.place.kind == "sensor":  # no residual holds sensors other than the joints'
@@ -68,6 +75,8 @@ def options_of(world, recordings):
         if candidate.effect.overrides("probes") and unseen(world, candidate.place, recordings):
             continue
         candidate = world.suited(candidate, recordings)
+        if coarse != 1:
+            candidate = replace(candidate, parameters=tuple(replace(p, step=coarse * p.step) for p in candidate.parameters))
         if candidate.effect.overrides("probes"):
             rows, n = [tuple(float(v) for v in row) for row in world.probes(candidate, recordings)], candidate.effect.together
             out += [Option(candidate, tuple(rows[k:k + n]), False) for k in range(0, len(rows), n)]
@@ -79,9 +88,10 @@ def options_of(world, recordings):
 
 
 class Scan:
-    def __init__(self, world, problem, recordings):
-        self.world, self.model, self.problem, self.recordings = world, world.model, problem, recordings
-        self.options = options_of(world, recordings)
+    def __init__(self, world, problem, recordings, coarse=False):
+        """coarse: with larger steps, as where predictions jump."""
+        self.world, self.model, self.problem, self.recordings, self.coarse = world, world.model, problem, recordings, coarse
+        self.options = options_of(world, recordings, COARSE if coarse else 1.0)
         self.freedom = freedom(problem)
         # refits that only have to tell hypotheses apart use some of the windows
         few = max(FEW, len(problem.windows) // 4)

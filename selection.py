@@ -12,7 +12,7 @@ import numpy as np
 
 import scores
 import shooting
-from scan import WORTH, Scan, Trial
+from scan import WORTH, Scan, Trial, at_noise
 
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 # in squared residual: of a parameter; of an effect one level less simple; up to which few windows do not decide between two
@@ -20,14 +20,16 @@ PRICE, ODDS, DOUBT = 2.0, 2.0, 8.0
 FAR = 2.0  # squared residual over the noise's
 SHARE = 0.05  # of what several effects explain together, that one in their place may leave
 LESS = 0.03  # share of an effect, from whose absence that of the whole is extrapolated
+LEAST_GROWTH = 1.05  # of a value that is moved on by more and more
+RENEWED, RIVAL = 3, 1.5  # of the refits, the best, whose start states are found anew; times the best's squared residual, of a rival
 DOUBTFUL = 3  # candidates that are refitted for their gain alone, where much is left
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
 
 
 class Search(Scan):
-    def run(self, fit, most=6):
-        """Additions, drops and swaps from the nominal fit: a Fit."""
-        late, refused, pairs = False, set(), []
+    def run(self, fit, most=6, late=False):
+        """Additions, drops and swaps from a fit: a Fit. late: nothing is held back until what is simple is exhausted."""
+        always, refused, pairs = late, set(), []
         for _ in range(most):
             trials, gram, score, chi2 = self.trials(fit, late)
             self.ranking = self.ranking or trials
@@ -38,6 +40,7 @@ class Search(Scan):
                 for candidate, start in proposal:
                     hypotheses[i] = hypotheses[i].plus(candidate, start)
             fits = shooting.solve(self.small, hypotheses, fit.subset(self.few), iterations=4)
+            fits = self.renewed(fits, self.small)
             chosen = self.choose(fit, fits, proposals) if proposals else None
             if chosen is None and late:
                 break
@@ -46,9 +49,10 @@ class Search(Scan):
             elif len(chosen[1]) > 1 and not late:  # one of the flexible may do alone what this pair does
                 late, pairs = True, [[(c, chosen[0].hypothesis.settings[c]) for c in chosen[1]]]
             else:
-                late, refused, pairs = False, set(), []
+                late, refused, pairs = always, set(), []
                 fit, added = chosen
-                fit = self.drop(shooting.renewed(self.problem, fit), added)
+                fit = shooting.renewed(self.problem, fit)
+                fit = self.drop(self.stretched(fit, added) if self.coarse else fit, added)
         return fit
 
     def proposals(self, fit, trials, gram, score, chi2, looks=12, singles=5, doubles=2):
@@ -76,6 +80,33 @@ class Search(Scan):
         best = max((t.gain for t in trials if t.start), default=0.0)
         return out + [list(pair) for gain, *pair in self.pairs(trials, gram, score, doubles)
                       if gain > best + max(2 * worth * chi2, 0.1 * best)]
+
+    def renewed(self, fits, problem):
+        """Fits of a problem, the best of them with start states found anew where none reaches the noise: they may have stuck on
+        the way, as feet and balls bounce, and decide between rivals."""
+        order = sorted(range(len(fits)), key=lambda i: fits[i].chi2.sum())[:RENEWED]
+        if not self.coarse:
+            order = [i for i in order if fits[i].chi2.sum() < RIVAL * fits[order[0]].chi2.sum()]
+        if order and not at_noise(problem, fits[order[0]]) and (self.coarse or len(order) > 1):
+            for i in order:
+                fits[i] = shooting.renewed(problem, fits[i], most=1)
+        return fits
+
+    def stretched(self, fit, added, most=12):
+        """A fit with the values of added effects moved on together, or back, while that leaves less with start states found anew:
+        where predictions jump, a step of all at once ends at the next jump."""
+        growth = 2.0
+        for _ in range(most):
+            if growth < LEAST_GROWTH or at_noise(self.problem, fit):
+                break
+            tried = [stretch(fit.hypothesis, added, factor) for factor in (growth, 1 / growth)]
+            led = shooting.follow(self.problem, shooting.evaluate(self.problem, tried, fit), iterations=2)
+            best = min((f.better(shooting.fit_starts(self.problem, f.hypothesis, sharp=False)) for f in led), key=lambda f: f.chi2.sum())
+            if best.chi2.sum() < (1 - shooting.STUCK) * fit.chi2.sum():
+                fit = best
+            else:
+                growth = np.sqrt(growth)
+        return fit
 
     def swaps(self, fit):
         """Effects without gradient for which a simpler one may stand: [(the hypothesis without that, [(the other, its best start)]), ...]."""
@@ -132,7 +163,7 @@ class Search(Scan):
             added = tuple(candidate for candidate, _ in proposals[i])
             if 1 - fits[i].chi2.sum() / before < 0.5 * worth * len(added):
                 continue
-            [new] = shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4)
+            [new] = self.renewed(shooting.solve(self.problem, [fits[i].hypothesis], fit, iterations=4), self.problem)
             needed = worth * sum(len(c.parameters) if c.effect.simplicity > 2 else 1 for c in added)
             if not new.hypothesis.possible or 1 - new.chi2.sum() / fit.chi2.sum() < needed or not self.shared(fit, new, worth):
                 continue
@@ -219,13 +250,17 @@ class Search(Scan):
         return fit, possible
 
     def united(self, fit, most=3):
-        """The fit, or one with a single effect where several of one joint together only looked like it, and what else then is needed."""
-        for place in dict.fromkeys(c.place for c in fit.hypothesis.candidates if c.place.kind == "joint"):
-            several = [c for c in fit.hypothesis.candidates if c.place == place]
+        """The fit, or one with a single effect where several at one joint, its body or motor together only looked like it, and what
+        else then is needed."""
+        for joint in range(self.model.njnt):
+            near = lambda candidate: joint in (self.world.joints(candidate.place) or ())
+            several = [c for c in fit.hypothesis.candidates if near(c)]
             if len(several) < 2:
                 continue
             rest, small = fit.hypothesis.minus(*several), fit.subset(self.few)
-            tried = [rest.plus(o.candidate, o.directions[0]) for o in self.options if o.candidate.place == place and o.candidate not in several]
+            fewer = lambda candidate: len(candidate.parameters) < sum(len(c.parameters) for c in several)
+            tried = [rest.plus(o.candidate, o.directions[0]) for o in self.options
+                     if near(o.candidate) and o.candidate not in several and fewer(o.candidate)]
             start = {}
             for i in np.argsort(self.left(fit, tried)):
                 start.setdefault(tried[i].candidates[-1], tried[i])
@@ -349,6 +384,17 @@ class Search(Scan):
         for f in sorted((f for f in fits if f.hypothesis.possible), key=lambda f: f.chi2.sum()):
             best.setdefault(f.hypothesis.candidates[-1], f)
         return [(f, c) for c, f in best.items()], pair
+
+
+def stretch(hypothesis, candidates, factor):
+    """A hypothesis with the distances of some candidates' values from the nominal ones times a factor, inside their bounds."""
+    for c in candidates:
+        values, nominal = np.array(hypothesis.settings[c]), np.array(c.nominal)
+        n = c.effect.amplitudes or len(values)  # the others of an effect without gradient say where it acts, not how much
+        origin = np.where(np.isfinite(nominal), nominal, 0.0)
+        moved = np.where(np.arange(len(values)) < n, origin + factor * (values - origin), values)
+        hypothesis = hypothesis.plus(c, np.clip(moved, [p.low for p in c.parameters], [p.high for p in c.parameters]))
+    return hypothesis
 
 
 def same_unit(one, other):

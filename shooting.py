@@ -21,6 +21,7 @@ STUCK = 0.02  # share of the squared residual that start states found anew have 
 POOR = 4.0  # standard deviations of noise's square by which a window leaves more than the best quarter, that make it poor
 FIRST = 8, 3  # rows that a start is led from; where they are far apart
 LED, LEADS = 4, 2  # iterations each time; steps of the parameters at which it is done
+DRAWS, DRAWN = 24, 4  # start states drawn for a poor window; of these, at most, from which it is fitted
 SHORT = 0.1  # of a parameter's step, below which it turns round
 KEPT = 8  # fits of start states that are remembered
 
@@ -56,6 +57,7 @@ def fit_starts(problem, hypothesis, iterations=12, sharp=True):
     [fit] = _fit_starts(problem, [begun], 2 if sharp else iterations, fresh=True)
     if not sharp:
         [fit] = led(problem, [fit])
+        fit = scattered(problem, fit)
     if problem.key:
         kept[key] = fit
         if len(kept) > KEPT:
@@ -129,9 +131,7 @@ def led(problem, fits):
     any other start ends in a local minimum. Windows are poor beside the best quarter of their fit. Where rows are far apart
     it begins with the observer's state and three rows, else with the recorded one and eight.
     """
-    free = problem.free
-    each = np.array([f.chi2 / free for f in fits])
-    owner, which = np.nonzero(each > (1 + POOR * np.sqrt(2 / free)) * np.quantile(each, 0.25, axis=1, keepdims=True))
+    owner, which = np.nonzero(is_poor(problem, np.array([f.chi2 for f in fits])))
     if not len(which):
         return fits
     settings = [fits[h].hypothesis.settings for h in owner]
@@ -148,12 +148,51 @@ def led(problem, fits):
         if part is problem:
             break
         rows += max(1, rows // 2)
-    better = (residual**2).sum(1) < np.array([fits[h].chi2[w] for h, w in zip(owner, which)])
-    out = [Fit(f.hypothesis, f.qpos.copy(), f.qvel.copy(), f.residual.copy(), f.start_jacobian.copy()) for f in fits]
-    for i in np.flatnonzero(better):
-        f, w = out[owner[i]], which[i]
-        f.qpos[w], f.qvel[w], f.residual[w], f.start_jacobian[w] = qpos[i], qvel[i], residual[i], jacobian[i]
+    parts = qpos, qvel, residual, jacobian
+    return [replaced(f, which[owner == h], *(x[owner == h] for x in parts)) for h, f in enumerate(fits)]
+
+
+def scattered(problem, fit, rounds=2):
+    """The fit with the start states of its poor windows sought among others drawn about them, as far as noise leaves them open
+    and farther: where something is met in one step of time or in the next, no slope leads from one to the other."""
+    rng, size, settings = np.random.default_rng(0), 2 * problem.model.nv, fit.hypothesis.settings
+    for _ in range(rounds):
+        poor = np.flatnonzero(is_poor(problem, fit.chi2))
+        if not len(poor):
+            break
+        spread = np.linalg.cholesky(_eliminate(fit.start_jacobian[poor], np.zeros(len(poor))))
+        drawn = rng.normal(size=(len(poor), DRAWS, size)) * 2.0 ** (np.arange(DRAWS) % 4)[:, None]
+        which = np.repeat(poor, DRAWS)
+        qpos, qvel = problem.moved(fit.qpos[which], fit.qvel[which], np.einsum("wij,wdj->wdi", spread, drawn).reshape(-1, size))
+        residual = problem.residuals([settings] * len(which), which, qpos, qvel)
+        cost = (residual**2).sum(1).reshape(-1, DRAWS)
+        order = np.argsort(cost, axis=1)[:, :DRAWN] + DRAWS * np.arange(len(poor))[:, None]
+        kept = order[cost.ravel()[order] < fit.chi2[poor, None]]  # about a lowest point all are higher: these are of another
+        if not len(kept):
+            break
+        which, qpos, qvel, residual = (x[kept] for x in (which, qpos, qvel, residual))
+        several = [settings] * len(kept)
+        jacobian = problem.start_jacobians(several, which, qpos, qvel, residual)
+        found = _descended(problem, several, which, qpos, qvel, residual, jacobian, LED, True)
+        fit = replaced(fit, which, *found)
+    return fit
+
+
+def replaced(fit, which, qpos, qvel, residual, jacobian):
+    """The fit with every window's best of other start states, the i-th of window which[i], where that leaves less."""
+    out = Fit(fit.hypothesis, *(getattr(fit, x).copy() for x in ("qpos", "qvel", "residual", "start_jacobian")))
+    cost, chi2 = (residual**2).sum(1), fit.chi2
+    for i in np.argsort(-cost):  # the best last
+        if cost[i] < chi2[which[i]]:
+            w = which[i]
+            out.qpos[w], out.qvel[w], out.residual[w], out.start_jacobian[w] = qpos[i], qvel[i], residual[i], jacobian[i]
     return out
+
+
+def is_poor(problem, chi2):
+    """Which windows (..., W) leave much more of the squared residual (..., W) than the best quarter does."""
+    each = chi2 / problem.free
+    return each > (1 + POOR * np.sqrt(2 / problem.free)) * np.quantile(each, 0.25, axis=-1, keepdims=True)
 
 
 # ---- hypotheses with parameters ----------------------------------------------------------------

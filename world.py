@@ -128,16 +128,16 @@ class World:
 
     def related(self, candidate):
         """Candidates at the same joints in whose wrong values this one may hide, or theirs in its."""
-        mine, out = self._joints(candidate.place), []
+        mine, out = self.joints(candidate.place), []
         for other in self.candidates:
-            theirs = self._joints(other.place)
+            theirs = self.joints(other.place)
             akin = other.effect.name in candidate.effect.related or candidate.effect.name in other.effect.related
             if akin and other.effect.name != candidate.effect.name:
                 if mine is None or theirs is None or mine & theirs:
                     out.append(other)
         return out
 
-    def _joints(self, place):
+    def joints(self, place):
         """Ids of the joints a place belongs to, or None for all."""
         m = self.model
         if place.kind == 'joint':
