@@ -114,7 +114,7 @@ def searched(data, say):
             # of what reaches the noise in short windows and not in long ones, the start states are wrong there
             kept = found if found[2] < span and found[1].chi2.sum() < selection.FAR * found[0].problem.rows else None
             search, fit, span = found
-        if not (i or fit.hypothesis.effects):
+        if not (i or fit.hypothesis.effects) and observer.far_apart(train):
             search, fit, span = further(data, search, fit, span, say)
         hypothesis = fit.hypothesis
         ranking = ranking or search.ranking
@@ -144,7 +144,7 @@ def shorter(data, search, fit, span, say):
 def further(data, search, fit, span, say):
     """(Search, Fit, span) of longer windows in which something is found and then nothing left, or as given.
 
-    Where rows are far apart, windows are kept as short as start states need them, and in those a small fault is not seen.
+    For rows far apart: there windows are kept as short as start states need them, and in those a small fault is not seen.
     """
     world, train = data[:2]
     more_span, most = span, span_for(*data, fit.hypothesis, at_least=span, scatter=np.inf)

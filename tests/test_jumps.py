@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import earning
 import identify
 import misfit
 import selection
@@ -81,8 +82,9 @@ def test_values_are_stretched_from_the_nominal_ones():
 def test_a_value_that_stopped_at_a_jump_is_moved_on():
     world, runs = World(mujoco.MjSpec.from_string(DROP.format(damping=-90))), [dropped(seed, -40) for seed in range(4)]
     problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.2)], np.array([NOISE]), np.array([np.inf]))
-    search, damping = selection.Search(world, problem, runs), world.candidate("contact_damping", "block")
+    search, damping = selection.Search(world, problem, runs, coarse=True), world.candidate("contact_damping", "block")
     fit = shooting.fit_starts(problem, misfit.Hypothesis().plus(damping, (85.0,)))
+    assert not earning.is_far(search, fit) and earning.is_far(selection.Search(world, problem, runs), fit)  # it is jumps that keep it there
     new = search.stretched(fit, (damping,))
     assert fit.chi2.sum() > 3 * search.freedom and new.chi2.sum() < 1.2 * search.freedom
     assert new.hypothesis.vector[0] < 50
