@@ -40,7 +40,7 @@ GROSS = 5.0  # residual of a window over the usual one, that it may count for
 MUCH, UNFOUND = 4.0, 0.05  # squared residual, over the noise's and the nominal model's, above which shorter windows are tried
 LONGER = 1.3  # times what the shortest windows leave, up to which rows far apart are followed
 UNLIKELY = 3.0  # standard deviations of the squared residual, that an event must spare
-MANY = 3  # effects, of which a few may be one in disguise
+MANY, SOME = 3, 60  # effects, of which a few may be one in disguise; windows in which another search will do
 ROUNDS, MORE = 3, 1.5  # of search, each with windows longer by this at least
 LONGEST = 1.3  # s, of a window
 FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
@@ -160,8 +160,8 @@ def further(data, search, fit, span, say):
 def sought(world, train, problem, hypothesis):
     """(Search, Fit, squared residual at the beginning) of what a problem's windows say, begun at a hypothesis.
 
-    Where that leaves much, or takes many effects, once more from nothing: with nothing held back, and with larger steps. Where
-    something is met in one step of time or in the next predictions jump, and small steps see the jumps alone.
+    Where nothing was known and that leaves much, or takes many effects, it is done again: with nothing held back, and with larger
+    steps. Where something is met in one step of time or in the next predictions jump, and small steps see the jumps alone.
     """
     problem, fit = bounded(problem, hypothesis)
     before = fit.chi2.sum()
@@ -172,14 +172,27 @@ def sought(world, train, problem, hypothesis):
     fit = search.run(fit)
     nothing = not fit.hypothesis.effects and not scan.at_noise(problem, fit)
     several = [c for c in fit.hypothesis.candidates if c.effect.name != "time_step"]
-    if nothing or search.leaves_much(fit) or len(several) >= MANY:
-        other = selection.Search(world, problem, train, coarse=True)
-        new = other.run(shooting.fit_starts(problem, misfit.Hypothesis()), late=True)
-        size = lambda f: len(f.hypothesis.parameters)
-        least_gain = -scan.WORTH if size(new) < size(fit) else search.worth(fit)
-        if new.hypothesis.effects and new.hypothesis.possible and new.chi2.sum() < (1 - least_gain) * fit.chi2.sum():
-            search, fit = other, new
+    if not hypothesis.effects and (nothing or search.leaves_much(fit) or len(several) >= MANY):
+        search, fit = again(search, fit)
     return search, fit, before
+
+
+def again(search, fit):
+    """(Search, Fit) of a search from nothing with larger steps and nothing held back, in some of the windows where these are
+    many; as given, where it finds nothing better."""
+    number = len(search.problem.windows)
+    some = np.unique(np.linspace(0, number - 1, min(number, SOME)).round().astype(int))
+    part, size = search.problem.subset(some), lambda f: len(f.hypothesis.parameters)
+    better = lambda new, old: new.chi2.sum() < (1 + scan.WORTH if size(new) < size(old) else 1 - search.worth(fit)) * old.chi2.sum()
+    new = selection.Search(search.world, part, search.recordings, coarse=True)
+    found = new.run(shooting.fit_starts(part, misfit.Hypothesis()), late=True)
+    if not found.hypothesis.effects or not found.hypothesis.possible or not better(found, fit.subset(some)):
+        return search, fit
+    if len(some) < number:
+        new = selection.Search(search.world, search.problem, search.recordings, coarse=True)
+        begun = shooting.fit_starts(search.problem, found.hypothesis)
+        [found] = shooting.solve(search.problem, [found.hypothesis], begun)
+    return (new, found) if better(found, fit) else (search, fit)
 
 
 def bounded(problem, hypothesis):

@@ -20,7 +20,7 @@ PRICE, ODDS, DOUBT = 2.0, 2.0, 8.0
 FAR = 2.0  # squared residual over the noise's
 SHARE = 0.05  # of what several effects explain together, that one in their place may leave
 LESS = 0.03  # share of an effect, from whose absence that of the whole is extrapolated
-LEAST_GROWTH = 1.05  # of a value that is moved on by more and more
+LEAST_GROWTH, VALLEY = 1.05, 2.0  # of a value that is moved on; times the squared residual, above which both ways lead up
 RENEWED, RIVAL = 3, 1.5  # of the refits, the best, whose start states are found anew; times the best's squared residual, of a rival
 DOUBTFUL = 3  # candidates that are refitted for their gain alone, where much is left
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
@@ -105,7 +105,7 @@ class Search(Scan):
             if best.chi2.sum() < (1 - shooting.STUCK) * fit.chi2.sum():
                 fit = best
             else:
-                growth = np.sqrt(growth)
+                growth **= 0.5 if best.chi2.sum() < VALLEY * fit.chi2.sum() else 0.25
         return fit
 
     def swaps(self, fit):
