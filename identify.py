@@ -11,10 +11,8 @@
 Held-out recordings enter only after everything is chosen and fitted.
 """
 
-import warnings
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 
 import clock
@@ -29,21 +27,16 @@ import unknown
 import windows as cut
 from earning import earned
 from recordings import RecordingError
+from spans import FEW_ROWS, FINAL_STEPS, LEAST_ROWS, MORE, SEARCH_STEPS, problem_of, shortest_rows, span_for, windows_for
 
-SEARCH_STEPS = 10000  # simulated steps of one pass over the windows: in the search, and in the final fit
-FINAL_STEPS = 30000
-LEAST_ROWS, LEAST_APART, LEAST_WINDOWS, FEW_ROWS = 8, 3, 20, 100
 LEFTOVER_SPANS = 0.2, 0.1  # s
 MOST = 0.7  # share of the squared residual, that a leftover explains, above which no shorter windows are asked
 STAND_IN = 0.1  # share of what named effects and a leftover curve explain, up to which the curve does without them
 GROSS = 5.0  # residual of a window over the usual one, that it may count for
 MUCH, UNFOUND = 4.0, 0.05  # squared residual, over the noise's and the nominal model's, above which shorter windows are tried
-LONGER = 1.3  # times what the shortest windows leave, up to which rows far apart are followed
 UNLIKELY = 3.0  # standard deviations of the squared residual, that an event must spare
 MANY, SOME = 3, 60  # effects, of which a few may be one in disguise; windows in which another search will do
-ROUNDS, MORE = 3, 1.5  # of search, each with windows longer by this at least
-LONGEST = 1.3  # s, of a window
-FOLLOWS, FOLLOWS_SHARE = 8.0, 0.03  # residual, in noises and as a share of the motion, above which windows are too long
+ROUNDS = 3  # of search, each with longer windows
 
 
 def identify(world, train, held_out, progress=None):
@@ -127,7 +120,7 @@ def shorter(data, search, fit, span, say):
     What longer windows said, wrong as its value may be for start states that stuck there, is a beginning in these.
     """
     world, train = data[:2]
-    less_span, shortest = span, least(train) * cut.sampling(train)
+    less_span, shortest = span, shortest_rows(train) * cut.sampling(train)
     while less_span > MORE * shortest:
         less_span = max(less_span / 3, shortest)
         say(0.15, f"searching {len(world.candidates)} candidates in {less_span:.2g} s windows")
@@ -232,89 +225,6 @@ def lowered_noise(world, train, position, velocity, hypothesis):
     for dofs in cut.channels(model).values():
         left[dofs] = cut.pooled(left[dofs])
     return np.minimum(position, left[:model.nv]), np.minimum(velocity, left[model.nv:]) if len(left) > model.nv else velocity
-
-
-def windows_for(world, recordings, span, steps, event=None):
-    """Windows of span seconds spread evenly over the recordings, at most `steps` simulated steps in all."""
-    every, fewest = [], least(recordings)
-    for r in recordings:
-        sample = np.median(np.diff(r.time))
-        for first, end in events.quiet(r, event):
-            every += cut.consecutive(r, max(span, fewest * sample), first, end)
-    duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
-    number = max(LEAST_WINDOWS, int(steps / dear(world.model) * world.model.opt.timestep / duration))
-    return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]
-
-
-def least(recordings):
-    """Intervals between rows in the shortest windows: where rows are far apart much happens between two."""
-    return LEAST_APART if observer.far_apart(recordings) else LEAST_ROWS
-
-
-def dear(model):
-    """What one step of a model costs, about, with a two-joint arm's as 1."""
-    runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    return (6 + model.nv) / 8 * (3.0 if runge_kutta else 1.0)
-
-
-def problem_of(world, recordings, position_noise, velocity_noise, event, span, steps):
-    return misfit.Problem(world, windows_for(world, recordings, span, steps, event), position_noise, velocity_noise)
-
-
-def missed(problem, fit):
-    """Median residual of windows, in noises."""
-    return np.sqrt(np.median(fit.chi2 / problem.free))
-
-
-def follows(problem, fit, share_allowed):
-    """Whether a model follows its windows: the median residual is a few noises, or a small part of the motion."""
-    weight, size = problem.weight, problem.weight[0].size
-    if missed(problem, fit) < FOLLOWS:
-        return True
-    gap = fit.residual[:, :size].reshape(weight.shape) / np.where(weight > 0, weight, np.inf)
-    with warnings.catch_warnings(action="ignore"):  # what was never measured has no spread
-        moved = np.nanstd(cut.difference(problem.model, problem.measured_qpos[:, :1], problem.measured_qpos), axis=1)
-    share = np.sqrt((gap[..., :problem.model.nv] ** 2).mean(1)) / np.maximum(moved, 1e-12)
-    known = (weight[..., :problem.model.nv] > 0).any(1)
-    return bool(np.median(share[known] if known.any() else 0.0) < share_allowed)
-
-
-def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at_least=0.0, scatter=LONGER):
-    """The longest window span that the model with a hypothesis follows, from a few samples up.
-
-    Up to LONGEST (or a few dozen rows) while the residual is a few noises; where recordings are far more precise than
-    any model, longer windows only add nonlinearity, and half the reported horizon is enough. Where rows are far apart
-    start states soon end in local minima, and longer windows are to leave no more than `scatter` times what the shortest do.
-    """
-    sample = cut.sampling(train)
-    duration = np.median([np.ptp(r.time) for r in train])
-    shortest = max(least(train) * sample, at_least)
-    if sum(len(r.time) for r in train) < FEW_ROWS:  # too little to be cut
-        return float(max(np.ptp(r.time) for r in train))
-    enough = sum(np.ptp(r.time) for r in train) / 12  # clusters need windows
-    longest = max(shortest, min(max(LONGEST, 40 * sample), 0.5 * duration, enough))
-    if longest < MORE * at_least:
-        return at_least
-
-    def fitted(span):
-        problem = problem_of(world, train, position_noise, velocity_noise, event, span, SEARCH_STEPS / 4)
-        return problem, shooting.fit_starts(problem, hypothesis, sharp=False)
-
-    def followed(span):
-        problem, fit = fitted(span)
-        return follows(problem, fit, FOLLOWS_SHARE if span < 0.6 * cut.HORIZON else 0.0) and missed(problem, fit) < most
-
-    most = scatter * missed(*fitted(shortest)) if observer.far_apart(train) else np.inf
-    span = float(np.clip(cut.HORIZON / 2, shortest, longest))
-    if followed(span):
-        while span < longest and followed(min(2 * span, longest)):
-            span = min(2 * span, longest)
-        return span
-    while span / 2 >= shortest:
-        span /= 2
-        if followed(span):
-            break
-    return span
 
 
 def happened(data, search, hypothesis):

@@ -19,6 +19,7 @@ import unknown
 import windows as cut
 from effects import Candidate, Parameter
 from identify import identify, named_instead
+from plants import DROP, dropped
 from recordings import Recording
 from world import World
 
@@ -439,23 +440,6 @@ def test_seldom_and_mostly_unmeasured_rows_can_be_solved():
     begun = misfit.Hypothesis().plus(world.candidate("viscous_damping", "pivot"), (0.06,))
     [fit] = shooting.solve(problem, [begun], shooting.fit_starts(problem, misfit.Hypothesis()))
     assert fit.hypothesis.vector[0] > 0.06
-
-
-DROP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="5 5 .1" solref="-4000 {damping}"/>
-  <body name="block" pos="0 0 .05"><joint name="z" type="slide" axis="0 0 1" damping="0.3"/>
-  <geom name="block" type="box" size=".08 .08 .05" mass="1" solref="-4000 {damping}"/></body></worldbody></mujoco>"""
-
-
-def dropped(seed, damping):
-    """A block falls from somewhere, bounces and lies still, in stock MuJoCo: few rows hold what its contact is like."""
-    rng, model = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(DROP.format(damping=damping))
-    data, qpos = mujoco.MjData(model), np.empty((150, 1))
-    data.qpos[:] = rng.uniform(0.1, 0.3)
-    for t in range(len(qpos)):
-        qpos[t] = data.qpos
-        mujoco.mj_step(model, data, 5)
-    noisy = qpos + 1e-3 * rng.normal(size=qpos.shape)
-    return Recording(f"drop{seed}.csv", 0.01 * np.arange(len(qpos)), noisy, np.full(qpos.shape, np.nan), np.zeros((len(qpos), 0)), {})
 
 
 def test_what_shows_in_a_few_bounces_only_is_found():
