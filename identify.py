@@ -5,7 +5,8 @@
 
 1. Noise from differences of the recordings and from short windows that the nominal model can follow.
 2. The longest windows that the nominal model still follows; start states by Levenberg-Marquardt.
-3. Search over all candidates (selection.Search), again with the longer windows that the better model then follows.
+3. Search over all candidates (selection.Search), where that leaves much once more from nothing with larger steps; again
+   with the longer windows that the better model then follows.
 4. Final refit on more windows: intervals from the sandwich covariance between clusters of windows.
 5. What could stand in each finding's place; what is left unexplained.
 Held-out recordings enter only after everything is chosen and fitted.

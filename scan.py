@@ -66,7 +66,7 @@ def unseen(world, place, recordings):
     return not any(np.isfinite(r.qpos[:, q]).sum() > 1 for r in recordings)
 
 
-def options_of(world, recordings, coarse):
+def options_of(world, recordings, coarse=1.0):
     """Every way to try every candidate, with `coarse` times the usual steps. Effects with probes have no gradient at their nominal value."""
     out = []
     for candidate in world.candidates:
