@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 import misfit
-import shooting
+import starts
 
 WIDEST, STEPS = 0.06, 6  # of the clock's error; steps of the search, each of which halves what is left
 MANY = 4  # findings that are needed to stand in for a clock
@@ -39,4 +39,4 @@ def left(problem, ratio, hypothesis):
     other = problem.subset(np.arange(len(problem.windows)))
     other.windows = [w._replace(recording=scaled[id(w.recording)]) for w in problem.windows]
     other.guess_qvel = problem.guess_qvel / ratio
-    return shooting.fit_starts(other, hypothesis).chi2.sum()
+    return starts.fit(other, hypothesis).chi2.sum()

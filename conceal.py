@@ -151,7 +151,7 @@ def _scale(mechanism, model, rng):
     runs = _simulate(mechanism, Real(mechanism, []), rng, 1, 0.0, False, None)
     run = next(iter(runs.values()))
     data = mujoco.MjData(model)
-    torque, mobility, unit = [], [], np.zeros((1, model.nv))
+    torque, mobility = [], []
     for row in range(0, len(run.time), 5):
         data.qpos[:], data.qvel[:], data.ctrl[:] = run.true_qpos[row], run.true_qvel[row], run.ctrl[row]
         mujoco.mj_forward(model, data)

@@ -9,13 +9,13 @@ The error is the contract's (windows.error): consecutive windows, start as recor
 import numpy as np
 
 import misfit
-import shooting
+import starts
 import windows as cut
 
 
-def predict(world, settings, windows, starts=None):
+def predict(world, settings, windows, begun=None):
     """qpos (W, T, nq) and qvel (W, T, nv) of every window from its recorded start, or from the given ones."""
-    qpos, qvel = cut.recorded_starts(world.model, windows) if starts is None else starts
+    qpos, qvel = cut.recorded_starts(world.model, windows) if begun is None else begun
     return world.simulate([settings] * len(windows), qpos, qvel, windows)
 
 
@@ -54,7 +54,7 @@ def floor_gaps(world, settings, recordings, position_noise, velocity_noise, hori
     ends = [int(np.searchsorted(w.recording.time, w.recording.time[w.first] + cut.HORIZON * (1 + 1e-6), "right")) - 1 for w in windows]
     begun = [w._replace(last=max(min(w.last, end), w.first + 1)) for w, end in zip(early, ends)]
     problem = misfit.Problem(world, begun, position_noise, velocity_noise)
-    fit = shooting.fit_starts(problem, misfit.Hypothesis(tuple(settings.items())), sharp=False)
+    fit = starts.fit(problem, misfit.Hypothesis(tuple(settings.items())), sharp=False)
     truth, speed = predict(world, settings, early, (fit.qpos, fit.qvel))
     finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
     every, at = np.arange(len(windows)), np.array([w.first - e.first for w, e in zip(windows, early)])

@@ -8,7 +8,7 @@
 3. Search over all candidates (selection.Search), where that leaves much once more from nothing with larger steps; again
    with the longer windows that the better model then follows.
 4. Final refit on more windows: intervals from the sandwich covariance between clusters of windows.
-5. What could stand in each finding's place; what is left unexplained.
+5. What could stand in each finding's place (rivals); what is left unexplained.
 Held-out recordings enter only after everything is chosen and fitted.
 """
 
@@ -21,9 +21,11 @@ import events
 import findings
 import misfit
 import observer
+import rivals
 import scan
 import selection
 import shooting
+import starts
 import unknown
 import windows as cut
 from earning import earned
@@ -56,7 +58,7 @@ def identify(world, train, held_out, progress=None):
         data = world, train, position_noise, velocity_noise, event
         search, fit, ranking, span = searched(data, say)
     say(0.6, "alternatives")
-    fit, possible = search.settle(fit)
+    fit, possible = rivals.settle(search, fit)
     hypothesis = fit.hypothesis
     say(0.75, "testing for anything left")
     hypothesis, left, hint, possible = anything_left(data, search, hypothesis, possible)
@@ -102,8 +104,7 @@ def searched(data, say):
         if much and kept:  # too long again
             search, fit, span = kept
             break
-        nothing = not fit.hypothesis.effects and not scan.at_noise(search.problem, fit)
-        if (much or nothing) and not i:
+        if (much or search.gives_up(fit)) and not i:
             found = shorter(data, search, fit, span, say)
             # of what reaches the noise in short windows and not in long ones, the start states are wrong there
             kept = found if found[2] < span and found[1].chi2.sum() < selection.FAR * found[0].problem.rows else None
@@ -164,9 +165,8 @@ def sought(world, train, problem, hypothesis):
         [fit] = shooting.solve(problem, [hypothesis], fit)
         fit = search.drop(fit, ())
     fit = search.run(fit)
-    nothing = not fit.hypothesis.effects and not scan.at_noise(problem, fit)
     several = [c for c in fit.hypothesis.candidates if c.effect.name != "time_step"]
-    if not hypothesis.effects and (nothing or search.leaves_much(fit) or len(several) >= MANY):
+    if not hypothesis.effects and (search.gives_up(fit) or search.leaves_much(fit) or len(several) >= MANY):
         search, fit = again(search, fit)
     return search, fit, before
 
@@ -175,23 +175,23 @@ def again(search, fit):
     """(Search, Fit) of a search from nothing with larger steps and nothing held back, in some of the windows where these are
     many; as given, where it finds nothing better."""
     number = len(search.problem.windows)
-    some = np.unique(np.linspace(0, number - 1, min(number, SOME)).round().astype(int))
+    some = cut.evenly(number, SOME)
     part, size = search.problem.subset(some), lambda f: len(f.hypothesis.parameters)
     better = lambda new, old: new.chi2.sum() < (1 + scan.WORTH if size(new) < size(old) else 1 - search.worth(fit)) * old.chi2.sum()
     new = selection.Search(search.world, part, search.recordings, coarse=True)
-    found = new.run(shooting.fit_starts(part, misfit.Hypothesis()), late=True)
+    found = new.run(starts.fit(part, misfit.Hypothesis()), late=True)
     if not found.hypothesis.effects or not found.hypothesis.possible or not better(found, fit.subset(some)):
         return search, fit
     if len(some) < number:
         new = selection.Search(search.world, search.problem, search.recordings, coarse=True)
-        begun = shooting.fit_starts(search.problem, found.hypothesis)
+        begun = starts.fit(search.problem, found.hypothesis)
         [found] = shooting.solve(search.problem, [found.hypothesis], begun)
     return (new, found) if better(found, fit) else (search, fit)
 
 
 def bounded(problem, hypothesis):
     """The problem with less weight on windows whose residual is GROSS beside the others', lest a few decide alone; a Fit."""
-    fit = shooting.fit_starts(problem, hypothesis)
+    fit = starts.fit(problem, hypothesis)
     each = fit.chi2 / np.maximum((problem.weight > 0).sum((1, 2)), 1)
     factor = np.sqrt(np.minimum(GROSS**2 * max(np.median(each), 1.0) / np.maximum(each, 1e-300), 1.0))
     return (problem, fit) if factor.min() == 1 else problem.weighted(fit, factor)
@@ -218,7 +218,7 @@ def lowered_noise(world, train, position, velocity, hypothesis):
     model = world.model
     sample = cut.sampling(train)
     problem = problem_of(world, train, position, velocity, None, LEAST_ROWS * sample, SEARCH_STEPS)
-    fit, weight = shooting.fit_starts(problem, hypothesis, sharp=False), problem.weight
+    fit, weight = starts.fit(problem, hypothesis, sharp=False), problem.weight
     gap = fit.residual[:, :weight[0].size].reshape(weight.shape) / np.where(weight > 0, weight, 1)
     square, rows = np.where(weight > 0, gap**2, 0).sum(1), (weight > 0).sum(1)  # (W, 2 nv)
     left = np.array([np.sqrt(np.median(s[r > 3] / (r[r > 3] - 2))) if (r > 3).any() else np.inf for s, r in zip(square.T, rows.T)])
@@ -231,13 +231,13 @@ def lowered_noise(world, train, position, velocity, hypothesis):
 def happened(data, search, hypothesis):
     """What came and went for a while, beside what lasts or instead of it: an Event, if it leaves less than what lasts can; else None."""
     problem = problem_of(*data, LEFTOVER_SPANS[0], FINAL_STEPS)
-    lasting, found = shooting.fit_starts(problem, hypothesis), []
+    lasting, found = starts.fit(problem, hypothesis), []
     noise = scan.freedom(problem)
     total = lasting.chi2.sum()
     notable = max(STAND_IN * (total - noise), UNLIKELY * np.sqrt(2 * noise))  # of white noise's scatter
     instead = [hypothesis.minus(c) for c in hypothesis.candidates]  # what an event made look like something lasting
     for h in dict.fromkeys((hypothesis, *instead, misfit.Hypothesis())):
-        event = events.find(data[0], problem, lasting if h == hypothesis else shooting.fit_starts(problem, h))
+        event = events.find(data[0], problem, lasting if h == hypothesis else starts.fit(problem, h))
         if event and event.left < total - notable:
             found.append(event)
     event = min(found, key=lambda e: e.left) if found else None
@@ -264,10 +264,10 @@ def anything_left(data, search, hypothesis, possible):
     shortest = LEAST_ROWS * cut.sampling(data[1])
     spans = sorted({max(span, shortest) for span in LEFTOVER_SPANS}, reverse=True)
     for problem in [search.problem] + [problem_of(*data, span, SEARCH_STEPS) for span in spans]:
-        fit = shooting.fit_starts(problem, hypothesis)
+        fit = starts.fit(problem, hypothesis)
         if unknown.quiet(problem, fit):
             continue
-        bare = shooting.fit_starts(problem, misfit.Hypothesis()) if hypothesis.effects else fit
+        bare = starts.fit(problem, misfit.Hypothesis()) if hypothesis.effects else fit
         found = unknown.leftover(search, problem, fit, bare.chi2.sum())
         hint = hint or found
         notable = found and (found.large or len(hypothesis.effects) > 1 and found.share > MOST)
@@ -296,7 +296,7 @@ def anything_left(data, search, hypothesis, possible):
     renamed, others = named_instead(local, fit, curve)
     if renamed:
         return renamed, None, None, {**possible, **others}
-    fit, settled = local.settle(fit, but=(curve,))  # beside the curve others may look likelier
+    fit, settled = rivals.settle(local, fit, but=(curve,))  # beside the curve others may look likelier
     return fit.hypothesis, found, None, {**settled, **others}
 
 
@@ -304,7 +304,7 @@ def named_instead(search, fit, curve):
     """(the hypothesis with an effect of the catalogue in a curve's place, if one leaves no more than the curve, else None;
     {that effect, or the curve: [(error ratio, other candidate, values), ...]})."""
     small = fit.subset(search.few)
-    others = sorted(search.alternatives(fit, small, curve)[0], key=lambda o: o[0].chi2.sum())
+    others = sorted(rivals.alternatives(search, fit, small, curve)[0], key=lambda o: o[0].chi2.sum())
     listed = [(float(np.sqrt(f.chi2.sum() / small.chi2.sum())), c, f.hypothesis.settings[c]) for f, c in others]
     if others and others[0][0].chi2.sum() <= (1 + selection.WORTH) * small.chi2.sum():
         [new] = shooting.solve(search.problem, [others[0][0].hypothesis], fit)

@@ -15,6 +15,7 @@ import numpy as np
 import misfit
 import scores
 import shooting
+import windows as cut
 
 WORTH, WORTH_MISFIT = 0.03, 0.1  # least fall of the squared residual that an effect must bring; where it is far above the noise
 FLEXIBLE = "inertia", "nonlinear_stiffness"  # with many ways to bend, they too come late
@@ -94,8 +95,7 @@ class Scan:
         self.options = options_of(world, recordings, COARSE if coarse else 1.0)
         self.freedom = freedom(problem)
         # refits that only have to tell hypotheses apart use some of the windows
-        few = max(FEW, len(problem.windows) // 4)
-        self.few = np.unique(np.linspace(0, len(problem.windows) - 1, min(few, len(problem.windows))).round().astype(int))
+        self.few = cut.evenly(len(problem.windows), max(FEW, len(problem.windows) // 4))
         self.small = problem.subset(self.few)
         self.scouts = self.few[::2]
         self.scouting = problem.subset(self.scouts)

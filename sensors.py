@@ -16,7 +16,7 @@ import events
 import evidence
 import misfit
 import scores
-import shooting
+import starts
 import windows as cut
 from effects import SLIDE
 
@@ -84,8 +84,8 @@ def noise_of(recordings, name):
 def errors(world, settings, recordings):
     """{sensor: {"before", "after", "noise": RMS over windows as of the reported error, "unit"}}; infinite where it blows up."""
     known, windows, out = recorded(world.model, recordings), evidence.consecutive(recordings, cut.HORIZON), {}
-    starts = cut.recorded_starts(world.model, windows) if known else None
-    predicted = {k: world.simulate([s] * len(windows), *starts, windows, sensors=True)[2] for k, s in
+    begun = cut.recorded_starts(world.model, windows) if known else None
+    predicted = {k: world.simulate([s] * len(windows), *begun, windows, sensors=True)[2] for k, s in
                  (("before", {}), ("after", settings))} if known else {}
     for name, columns in known:
         seen = measured(windows, name, columns.stop - columns.start)[:, 1:]
@@ -109,7 +109,7 @@ def faults(world, settings, train, position_noise, velocity_noise, event=None, m
         return out
     windows = [w for r in train for first, end in events.quiet(r, event) for w in cut.consecutive(r, cut.HORIZON, first, end)]
     windows = windows[:: -(-len(windows) // most)]
-    fit = shooting.fit_starts(misfit.Problem(world, windows, position_noise, velocity_noise),
+    fit = starts.fit(misfit.Problem(world, windows, position_noise, velocity_noise),
                               misfit.Hypothesis(tuple(settings.items())), sharp=False)
     labels, early = scores.clusters(windows), np.zeros(measured(windows, "", 1).shape[:2], bool)
     for i, w in enumerate(windows):

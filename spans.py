@@ -12,7 +12,7 @@ import numpy as np
 import events
 import misfit
 import observer
-import shooting
+import starts
 import windows as cut
 
 SEARCH_STEPS, FINAL_STEPS = 10000, 30000  # simulated steps of one pass over the windows: in the search, and in the final fit
@@ -31,7 +31,7 @@ def windows_for(world, recordings, span, steps, event=None):
             every += cut.consecutive(r, max(span, fewest * sample), first, end)
     duration = np.median([w.recording.time[w.last] - w.recording.time[w.first] for w in every])
     number = max(LEAST_WINDOWS, int(steps / dear(world.model) * world.model.opt.timestep / duration))
-    return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(number, len(every))).round().astype(int))]
+    return [every[i] for i in cut.evenly(len(every), number)]
 
 
 def shortest_rows(recordings):
@@ -86,7 +86,7 @@ def span_for(world, train, position_noise, velocity_noise, event, hypothesis, at
 
     def fitted(span):
         problem = problem_of(world, train, position_noise, velocity_noise, event, span, SEARCH_STEPS / 4)
-        return problem, shooting.fit_starts(problem, hypothesis, sharp=False)
+        return problem, starts.fit(problem, hypothesis, sharp=False)
 
     def followed(span):
         problem, fit = fitted(span)

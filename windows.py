@@ -86,6 +86,11 @@ def sampling(recordings):
     return np.median([np.median(np.diff(r.time)) for r in recordings])
 
 
+def evenly(number, most):
+    """At most so many of 0 .. number - 1, evenly spread: indices, ascending."""
+    return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(int))
+
+
 def joint_name(model, joint):
     return model.joint(joint).name or str(joint)
 

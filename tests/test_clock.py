@@ -9,6 +9,7 @@ import pytest
 import clock
 import misfit
 import shooting
+import starts
 import windows as cut
 from tests.test_identify import NOISE, PENDULUM, recorded
 from world import World
@@ -25,7 +26,7 @@ def fitted(ratio, effects):
     for effect, place in effects:
         candidate = world.candidate(effect, place)
         hypothesis = hypothesis.plus(candidate, candidate.nominal)
-    [fit] = shooting.solve(problem, [hypothesis], shooting.fit_starts(problem, misfit.Hypothesis()))
+    [fit] = shooting.solve(problem, [hypothesis], starts.fit(problem, misfit.Hypothesis()))
     return problem, fit
 
 

@@ -12,9 +12,11 @@ import events
 import evidence
 import findings
 import misfit
+import rivals
 import scores
 import selection
 import shooting
+import starts
 import unknown
 import windows as cut
 from effects import Candidate, Parameter
@@ -198,11 +200,11 @@ def test_values_for_windows_are_those_that_other_recordings_say():
     noise, windows = np.array([NOISE]), [w for r in runs[1:] for w in cut.consecutive(r, 0.3)]
     problem = misfit.Problem(world, [w for r in runs[:3] for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
     damping = world.candidate("viscous_damping", "pivot")
-    [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(damping, (0.06,))], shooting.fit_starts(problem, misfit.Hypothesis()))
+    [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(damping, (0.06,))], starts.fit(problem, misfit.Hypothesis()))
     settings = earning.elsewhere(selection.Search(world, problem, runs), fit, windows)
     for w, s in zip(windows, settings):
         others = misfit.Problem(world, [v for r in runs[:3] if r is not w.recording for v in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
-        [alone] = shooting.solve(others, [fit.hypothesis], shooting.fit_starts(others, fit.hypothesis))
+        [alone] = shooting.solve(others, [fit.hypothesis], starts.fit(others, fit.hypothesis))
         assert s[damping][0] == pytest.approx(alone.hypothesis.vector[0], rel=0.01)
     before, after = (earning.overall(earning.gaps(world, s, windows, noise)) for s in ([{}] * len(windows), settings))
     assert after < 0.5 * before
@@ -216,7 +218,7 @@ def test_intervals_allow_for_a_finer_step_where_the_data_do():
         world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
         problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.5)], np.array([NOISE]), np.array([np.inf]))
         damping = world.candidate("viscous_damping", "pivot")
-        [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(damping, (0.058,))], shooting.fit_starts(problem, misfit.Hypothesis()))
+        [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(damping, (0.058,))], starts.fit(problem, misfit.Hypothesis()))
         [(low, high)] = findings.intervals(selection.Search(world, problem, runs), fit)[damping]
         assert low < 0.06 < high
         width[finer] = high - low
@@ -236,7 +238,7 @@ def test_what_was_not_seen_at_one_fit_is_looked_at_again_at_the_next():
     runs = [recorded(f"run{k}.csv", k, damping=0.08) for k in range(2)]
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
     problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.5)], np.array([NOISE]), np.array([np.inf]))
-    search, bare = selection.Search(world, problem, runs), shooting.fit_starts(problem, misfit.Hypothesis())
+    search, bare = selection.Search(world, problem, runs), starts.fit(problem, misfit.Hypothesis())
     search.trials(bare)
     damping, mass = world.candidate("viscous_damping", "pivot"), world.candidate("mass", "arm")
     [option] = [o for o in search.options if o.candidate == damping and o.linear]
@@ -262,7 +264,7 @@ def test_a_load_on_top_of_a_lasting_one_is_placed_in_time():
     world, run = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5))), loaded(2, 3.0, 4.0, (1.6, 2.4))
     problem = misfit.Problem(world, cut.consecutive(run, 0.2), np.array([NOISE]), np.array([np.inf]))
     heavy = misfit.Hypothesis().plus(world.candidate("mass", "arm"), (1.5,))
-    event = events.find(world, problem, shooting.fit_starts(problem, heavy))
+    event = events.find(world, problem, starts.fit(problem, heavy))
     assert event.candidate.effect.name == "payload_change"
     assert event.time == pytest.approx((1.6, 2.4), abs=0.05) and event.values[0] == pytest.approx(2.0, rel=0.05)
 
@@ -274,7 +276,7 @@ def test_an_effect_that_does_not_predict_other_recordings_better_goes():
     problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf]))
     damping, air = world.candidate("viscous_damping", "pivot"), world.candidate("air_drag", "world")
     both = misfit.Hypothesis().plus(damping, (0.06,)).plus(air, (50.0,))
-    [fit] = shooting.solve(problem, [both], shooting.fit_starts(problem, misfit.Hypothesis()))
+    [fit] = shooting.solve(problem, [both], starts.fit(problem, misfit.Hypothesis()))
     search = selection.Search(world, problem, runs)
     search.freedom = 1  # as where the model is far from the noise
     assert earning.earned(search, fit, windows, noise).hypothesis.candidates == (damping,)
@@ -288,7 +290,7 @@ def test_alternatives_are_refitted_and_listed_where_they_predict_as_well():
     damping, offset, bias, gain = (world.candidate(*c) for c in (("viscous_damping", "pivot"), ("spring_offset", "pivot"),
                                                                  ("bias", "drive"), ("gain", "drive")))
     true = misfit.Hypothesis().plus(damping, (0.08,)).plus(offset, (0.03,))
-    [fit] = shooting.solve(problem, [true], shooting.fit_starts(problem, misfit.Hypothesis()))
+    [fit] = shooting.solve(problem, [true], starts.fit(problem, misfit.Hypothesis()))
     others = [(1.0, gain, (1.01,)), (1.1, bias, (0.027,))]  # as few windows see them
     only, = findings.also_possible(selection.Search(world, problem, runs), fit, runs, noise, offset, others)
     assert (only["effect"], only["place"]["name"]) == ("bias", "drive")
@@ -300,7 +302,7 @@ def test_what_stands_in_a_curves_place_brings_its_equals_along():
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
     problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.2)], np.array([NOISE]), np.array([np.inf]))
     curve = world.curve("pivot", "velocity:pivot", (-5.0, 0.0, 5.0))
-    [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(curve, (0.2, 0.0, -0.2))], shooting.fit_starts(problem, misfit.Hypothesis()))
+    [fit] = shooting.solve(problem, [misfit.Hypothesis().plus(curve, (0.2, 0.0, -0.2))], starts.fit(problem, misfit.Hypothesis()))
     hypothesis, possible = named_instead(selection.Search(world, problem, runs), fit, curve)
     [(name, values)] = hypothesis.effects
     [(_, others)] = possible.items()
@@ -350,21 +352,21 @@ def test_start_states_and_damping_are_recovered_without_noise():
     run = recorded("run.csv", 2, damping=0.08, noise=0.0)
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
     problem = misfit.Problem(world, cut.consecutive(run, 0.5), np.array([1e-4]), np.array([np.inf]))
-    nominal = shooting.fit_starts(problem, misfit.Hypothesis())
+    nominal = starts.fit(problem, misfit.Hypothesis())
     damping = world.candidate("viscous_damping", "pivot")
     [fit] = shooting.solve(problem, [misfit.Hypothesis(((damping, (0.06,)),))], nominal, iterations=8)
     assert fit.hypothesis.vector[0] == pytest.approx(0.08, rel=1e-3)
     assert fit.chi2.sum() < 1e-3 * nominal.chi2.sum()
     again = misfit.Problem(world, problem.windows, np.array([1e-4]), np.array([np.inf]))
-    assert shooting.fit_starts(again, misfit.Hypothesis()) is nominal  # remembered
-    assert shooting.fit_starts(problem.subset([0, 1]), misfit.Hypothesis()) is not nominal
+    assert starts.fit(again, misfit.Hypothesis()) is nominal  # remembered
+    assert starts.fit(problem.subset([0, 1]), misfit.Hypothesis()) is not nominal
 
 
 def test_updated_start_jacobians_serve_as_well_as_fresh_ones():
     run = recorded("run.csv", 4, damping=0.2)
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
     problem = misfit.Problem(world, cut.consecutive(run, 0.5), np.array([NOISE]), np.array([np.inf]))
-    fit, every = shooting.fit_starts(problem, misfit.Hypothesis()), np.arange(len(problem.windows))
+    fit, every = starts.fit(problem, misfit.Hypothesis()), np.arange(len(problem.windows))
     qpos, qvel, residual = fit.qpos, fit.qvel, fit.residual
     for _ in range(5):  # plain Gauss-Newton
         jacobian = problem.start_jacobians([{}] * len(every), every, qpos, qvel, residual)
@@ -438,7 +440,7 @@ def test_seldom_and_mostly_unmeasured_rows_can_be_solved():
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
     problem = misfit.Problem(world, cut.consecutive(seldom, 0.2), np.array([NOISE]), np.array([np.inf]))
     begun = misfit.Hypothesis().plus(world.candidate("viscous_damping", "pivot"), (0.06,))
-    [fit] = shooting.solve(problem, [begun], shooting.fit_starts(problem, misfit.Hypothesis()))
+    [fit] = shooting.solve(problem, [begun], starts.fit(problem, misfit.Hypothesis()))
     assert fit.hypothesis.vector[0] > 0.06
 
 
@@ -481,9 +483,9 @@ def test_far_values_are_looked_at_where_a_fit_leaves_much():
     world, runs = World(mujoco.MjSpec.from_string(FALL)), [fallen(seed, 0.85) for seed in range(3)]
     problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.2)], np.array([NOISE]), np.array([np.inf]))
     search = selection.Search(world, problem, runs)
-    best, *_ = search.leaps(shooting.fit_starts(problem, misfit.Hypothesis()))
+    best, *_ = search.leaps(starts.fit(problem, misfit.Hypothesis()))
     assert best.option.candidate.effect.name == "sensor_scale" and best.start[0] == pytest.approx(0.85, rel=0.01)
-    assert not search.leaps(shooting.fit_starts(problem, misfit.Hypothesis().plus(best.option.candidate, (0.85,))))
+    assert not search.leaps(starts.fit(problem, misfit.Hypothesis().plus(best.option.candidate, (0.85,))))
 
 
 FINE = PENDULUM.replace("0.005", "0.00125").format(damping=0.05, mass=0.5)
@@ -636,8 +638,8 @@ def test_several_effects_of_a_joint_give_way_to_one_that_does_as_well(push, name
     search, hypothesis = selection.Search(world, problem, runs), misfit.Hypothesis()
     for name, values in (("stiffness", (1.0,)), ("spring_offset", (0.1,))):
         hypothesis = hypothesis.plus(world.candidate(name, "pivot"), values)
-    [fit] = shooting.solve(problem, [hypothesis], shooting.fit_starts(problem, misfit.Hypothesis()))
-    assert {c.effect.name for c in search.united(fit).hypothesis.candidates} == names
+    [fit] = shooting.solve(problem, [hypothesis], starts.fit(problem, misfit.Hypothesis()))
+    assert {c.effect.name for c in rivals.united(search, fit).hypothesis.candidates} == names
 
 
 @pytest.mark.parametrize("hertz", [1.374, 2.2])

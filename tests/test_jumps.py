@@ -10,7 +10,7 @@ import earning
 import misfit
 import prove
 import selection
-import shooting
+import starts
 import windows as cut
 from plants import DROP, dropped
 from world import World
@@ -22,15 +22,15 @@ def test_start_states_behind_a_bounce_are_drawn():
     """Starts from which the block meets the floor some steps too soon: every small step from them makes it worse."""
     world, runs = World(mujoco.MjSpec.from_string(DROP.format(damping=-30))), [dropped(seed, -30) for seed in range(3)]
     problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.2)], np.array([NOISE]), np.array([np.inf]))
-    good, nominal = shooting.fit_starts(problem, misfit.Hypothesis()), misfit.Hypothesis()
+    good, nominal = starts.fit(problem, misfit.Hypothesis()), misfit.Hypothesis()
     every = np.arange(len(problem.windows))
     settings = [nominal.settings] * len(every)
     rng = np.random.default_rng(0)
     qpos, qvel = good.qpos, good.qvel + 0.3 * rng.normal(size=good.qvel.shape)
     residual = problem.residuals(settings, every, qpos, qvel)
     jacobian = problem.start_jacobians(settings, every, qpos, qvel, residual)
-    [stuck] = shooting._fit_starts(problem, [misfit.Fit(nominal, qpos, qvel, residual, jacobian)], 12, fresh=True)
-    drawn = shooting.scattered(problem, stuck)
+    [stuck] = starts._fitted(problem, [misfit.Fit(nominal, qpos, qvel, residual, jacobian)], 12, fresh=True)
+    drawn = starts.scattered(problem, stuck)
     assert stuck.chi2.sum() > 3 * good.chi2.sum()
     assert drawn.chi2.sum() < 1.3 * good.chi2.sum()
     assert (drawn.chi2 <= stuck.chi2).all()
@@ -52,7 +52,7 @@ def test_a_value_that_stopped_at_a_jump_is_moved_on():
     world, runs = World(mujoco.MjSpec.from_string(DROP.format(damping=-90))), [dropped(seed, -40) for seed in range(4)]
     problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.2)], np.array([NOISE]), np.array([np.inf]))
     search, damping = selection.Search(world, problem, runs, coarse=True), world.candidate("contact_damping", "block")
-    fit = shooting.fit_starts(problem, misfit.Hypothesis().plus(damping, (85.0,)))
+    fit = starts.fit(problem, misfit.Hypothesis().plus(damping, (85.0,)))
     assert not earning.is_far(search, fit) and earning.is_far(selection.Search(world, problem, runs), fit)  # it is jumps that keep it there
     new = search.stretched(fit, (damping,))
     assert fit.chi2.sum() > 3 * search.freedom and new.chi2.sum() < 1.2 * search.freedom

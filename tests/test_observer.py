@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import shooting
+import starts
 from diagnose import _world
 from envs import model_path
 from misfit import Hypothesis, Problem
@@ -81,14 +82,14 @@ def test_led_starts_and_bounded_steps_find_a_mass_through_contacts():
     freedom = 6 * 9 - 18  # of a window
     truth = Hypothesis().plus(torso, (1.15 * torso.nominal[0],))
     good = lambda fit: np.mean(fit.chi2 < 2 * freedom)
-    led = good(shooting.fit_starts(problem, truth))
+    led = good(starts.fit(problem, truth))
     world.fits.clear()
     problem.far_apart = False
-    assert led > max(0.8, 0.1 + good(shooting.fit_starts(problem, truth)))
+    assert led > max(0.8, 0.1 + good(starts.fit(problem, truth)))
     world.fits.clear()
     problem.far_apart = True
     begun = Hypothesis().plus(torso, (1.02 * torso.nominal[0],))
-    [fit] = shooting.solve(problem, [begun], shooting.fit_starts(problem, Hypothesis()))
+    [fit] = shooting.solve(problem, [begun], starts.fit(problem, Hypothesis()))
     assert abs(fit.hypothesis.vector[0] / torso.nominal[0] - 1.15) < 0.02
 
 

@@ -12,6 +12,7 @@ import pytest
 import conceal
 import proof_page
 import prove
+import stock
 from hidden import Real
 from mechanisms import MECHANISMS, UNKNOWNS, Mechanism
 
@@ -128,7 +129,7 @@ def test_hand_written_physics_moves_as_mujocos_field_does(name, item, edit):
     for u in ctrl:
         hand.append(real.seen()[0])
         real.advance(u, mechanism.interval)
-    effect, difference = prove.rms(field - without), prove.rms(field - hand)
+    effect, difference = stock.rms(field - without), stock.rms(field - hand)
     loose = {"contact_friction": 0.05, "joint_stop": 0.02}        # MuJoCo's are soft, ours are not
     assert effect > 1e-3
     assert difference < loose.get(item["effect"], 0.002) * effect
@@ -333,7 +334,7 @@ def test_score(truth, findings, found, first, extras):
 @given(st.lists(st.floats(0.001, 0.2), min_size=2, max_size=200))
 def test_windows_tile_the_recording(steps):
     time = np.concatenate(([0.0], np.cumsum(steps)))
-    tiles = prove.windows(time)
+    tiles = stock.windows(time)
     assert all(a < b for a, b in tiles)
     assert all(b == c for (_, b), (c, _) in zip(tiles, tiles[1:])) and (not tiles or tiles[0][0] == 0)
     assert all(time[b] - time[a] <= 0.3 * (1 + 1e-6) for a, b in tiles)
@@ -345,12 +346,12 @@ def test_error_of_the_true_model_is_the_floor_and_without_noise_zero(tmp_path):
     assert truth["hidden"] == [] and truth["finer"] == 1
     mechanism, runs = MECHANISMS[truth["mechanism"]], list(trial.runs.values())[:1]
     nominal = mechanism.spec().compile()
-    floor = prove.hand_error(Real(mechanism, []), runs, truth["noise"], perfect=False)
-    assert prove.stock_error(nominal, nominal, runs, truth["noise"]) == pytest.approx(floor, rel=1e-6)
+    floor = stock.hand_error(Real(mechanism, []), runs, truth["noise"], perfect=False)
+    assert stock.stock_error(nominal, nominal, runs, truth["noise"]) == pytest.approx(floor, rel=1e-6)
     for run in runs:
         run.qpos, run.qvel = run.true_qpos, run.true_qvel
-    assert prove.stock_error(nominal, nominal, runs, truth["noise"]) < 1e-6
-    assert prove.hand_error(Real(mechanism, []), runs, truth["noise"], perfect=True) < 1e-6
+    assert stock.stock_error(nominal, nominal, runs, truth["noise"]) < 1e-6
+    assert stock.hand_error(Real(mechanism, []), runs, truth["noise"], perfect=True) < 1e-6
 
 
 def test_hidden_memory_runs_on_through_windows(tmp_path):
@@ -361,7 +362,7 @@ def test_hidden_memory_runs_on_through_windows(tmp_path):
     runs = list(conceal.record(truth, np.random.default_rng(0)).values())[:1]
     for run in runs:
         run.qpos, run.qvel = run.true_qpos, run.true_qvel
-    assert prove.hand_error(Real(mechanism, hidden, 4), runs, 0.001, perfect=False) < 1e-3
+    assert stock.hand_error(Real(mechanism, hidden, 4), runs, 0.001, perfect=False) < 1e-3
     assert prove.over_noise(truth, runs, {0}) > 1 and prove.over_noise(truth, runs, {1}) > 1
 
 
@@ -369,7 +370,7 @@ def test_an_appended_joint_is_left_alone():
     nominal = mujoco.MjModel.from_xml_string(HINGE)
     longer = mujoco.MjModel.from_xml_string(HINGE.replace("</worldbody>", '<body><joint name="more"/><geom size="1"/></body></worldbody>'))
     run = conceal.Run(np.arange(100) * 0.01, np.full((100, 1), 0.1), np.zeros((100, 1)), np.zeros((100, 1)), None, None, [], None)
-    assert prove.stock_error(nominal, longer, [run], 1.0) == pytest.approx(prove.stock_error(nominal, nominal, [run], 1.0))
+    assert stock.stock_error(nominal, longer, [run], 1.0) == pytest.approx(stock.stock_error(nominal, nominal, [run], 1.0))
 
 
 # the table and the page

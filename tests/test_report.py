@@ -25,6 +25,7 @@ import findings
 import leftover
 import motion
 import report
+import sections
 import wording
 from physics import EFFECTS
 from recordings import Recording
@@ -202,7 +203,7 @@ def test_a_saved_curve_is_the_force_that_is_simulated(diagnosis, tmp_path, varia
         np.testing.assert_allclose(times * np.interp(x, some[:, 0], some[:, -1]), expected, atol=0.01 if wave else 1e-7)
         if factor:
             np.testing.assert_allclose(rows[rows[:, 1] == -1, -1], -some[:, -1])
-    page = report.html_page(diagnosis)
+    page = sections.html_page(diagnosis)
     assert ("Acts times the" in page) == bool(factor) and ("A sine of 0.800 s" in page) == wave
 
 
@@ -394,7 +395,7 @@ def test_recordings_too_short_to_smooth_add_nothing(diagnosis):
     alone = leftover.residuals(diagnosis, 300)
     diagnosis.held_out = [short, good, holed]
     assert [len(r["x"]) for r in leftover.residuals(diagnosis, 900 - 3)] == [len(r["x"]) for r in alone] and alone
-    assert "force left at elbow" in report.html_page(diagnosis)
+    assert "force left at elbow" in sections.html_page(diagnosis)
 
 
 def test_rows_before_a_held_out_tail_are_not_drawn(diagnosis):
@@ -404,14 +405,14 @@ def test_rows_before_a_held_out_tail_are_not_drawn(diagnosis):
     assert np.abs(motion.poses(arm(), [tail])).max() < 20 and min(r["x"].max() for r in leftover.residuals(diagnosis)) < 20
     name, begin, _, motions = motion.overlay(diagnosis)
     assert name == whole.name and begin >= whole.time[150] and np.abs(motions["measured"]).max() < 20
-    assert f"Held out: {whole.name} from 1.50 s on." in report.html_page(diagnosis)
+    assert f"Held out: {whole.name} from 1.50 s on." in sections.html_page(diagnosis)
 
 
 def test_what_the_corrected_file_cannot_hold_is_not_drawn_as_corrected(diagnosis):
     diagnosis.summary["findings"] = [{**diagnosis.summary["findings"][0], "written_as": "none"}]
     assert all(np.isnan(r["after"]).all() and np.isfinite(r["before"]).all() for r in leftover.residuals(diagnosis))
     assert set(motion.overlay(diagnosis)[3]) == {"measured", "nominal"}
-    assert "by the corrected one" not in report.html_page(diagnosis)
+    assert "by the corrected one" not in sections.html_page(diagnosis)
 
 
 def test_the_experiment_for_two_rivals():
@@ -456,7 +457,7 @@ class Tags(HTMLParser):
 
 @pytest.mark.parametrize("kind", ["diagnosis", "matched"])
 def test_page_is_well_formed_and_self_contained(kind, request):
-    page = report.html_page(request.getfixturevalue(kind))
+    page = sections.html_page(request.getfixturevalue(kind))
     tags = Tags()
     tags.feed(page)
     assert tags.open == [] and set(tags.addresses) == {"data:,"}
@@ -466,7 +467,7 @@ def test_page_is_well_formed_and_self_contained(kind, request):
 
 
 def test_page_says_it_all(diagnosis):
-    page = report.html_page(diagnosis)
+    page = sections.html_page(diagnosis)
     for words in ("joint elbow: Coulomb friction 0.120 ± 0.004 N·m was left out", "dead zone", "push the joint by hand with the actuator off",
                   "has no plain MJCF form", "unexplained", "&lt;stays&gt;", "run5.csv", "error (× noise)", "force (N·m)", "a force that the catalogue has no name for", "force left at elbow (N·m)", "badmark", "gyro &lt;1&gt;",
                   "3 of 40 windows blow up under the nominal model: from then on they are left out of its line."):
@@ -508,7 +509,7 @@ def test_findings_tell_where_a_curve_has_its_knots_and_keep_numbers():
 
 
 def test_page_of_a_match_claims_nothing(matched):
-    page = report.html_page(matched)
+    page = sections.html_page(matched)
     assert "Nothing is missing" in page and "What is wrong" not in page and 'class="badmark"' not in page
 
 
@@ -531,7 +532,7 @@ PHONE = """<!DOCTYPE html><body style="margin:0"><p></p><iframe src="page.html" 
 @pytest.mark.skipif(BROWSER is None, reason="no browser")
 @pytest.mark.parametrize("kind", ["diagnosis", "matched"])
 def test_page_in_a_browser_on_a_phone(kind, request, tmp_path):
-    page = report.html_page(request.getfixturevalue(kind))
+    page = sections.html_page(request.getfixturevalue(kind))
     (tmp_path / "page.html").write_text(page.replace("<style>", PROBE + "<style>", 1), encoding="utf-8")
     (tmp_path / "phone.html").write_text(PHONE)
     done = subprocess.run([BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--enable-logging=stderr",

@@ -31,7 +31,7 @@ from rgat import (
     one_step_error,
     predict_all,
 )
-from trpo import Transitions, TRPOConfig, rollouts
+from trpo import TRPOConfig, rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SMALL = GroundingSettings(at=replace(AT_CONFIG, batch_size=64))
