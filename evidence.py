@@ -12,6 +12,8 @@ import misfit
 import starts
 import windows as cut
 
+DRAWS = 4  # of noise, for what a perfect simulator would miss
+
 
 def predict(world, settings, windows, begun=None):
     """qpos (W, T, nq) and qvel (W, T, nv) of every window from its recorded start, or from the given ones."""
@@ -30,22 +32,25 @@ def prediction_error(world, settings, recordings, noise, horizon=cut.HORIZON):
 
 
 def floor_error(world, settings, recordings, position_noise, velocity_noise):
-    """The error that a perfect simulator would have, as (all channels in noises, {channel: SI})."""
+    """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}), and how far the square of the
+    former scatters between recordings of the same motion, noise being what it is (a standard deviation)."""
     gap = floor_gaps(world, settings, recordings, position_noise, velocity_noise)[:, 1:]
     known = np.isfinite(gap)
     square = np.where(known, gap**2, 0.0)
     per_channel = {name: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
                    for name, dofs in cut.channels(world.model).items() if known[..., dofs].any()}
     noise = reporting_noise(position_noise)
-    return float(np.sqrt((square / noise**2).sum() / max(known.sum(), 1))), per_channel
+    total, count = (square / noise**2).sum((1, 2)).reshape(DRAWS, -1), max(known.sum(), 1)
+    scatter = np.sqrt(total.var(axis=0, ddof=1).sum()) * DRAWS / count  # windows are independent of each other
+    return float(np.sqrt(total.sum() / count)), per_channel, float(scatter)
 
 
-def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, most=300, draws=4, seed=0):
-    """What a perfect simulator would miss in at most `most` windows: (draws W, T, nv), NaN where nothing was measured.
+def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, most=300, seed=0):
+    """What a perfect simulator would miss in at most `most` windows: (DRAWS W, T, nv), NaN where nothing was measured.
 
     The corrected model from start states fitted to the first 0.3 s, from one row before each window on, stands for the
     truth. It is measured anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
-    by differences; `draws` times, for noise alone makes this vary.
+    by differences; DRAWS times, for noise alone makes this vary.
     """
     rng, model = np.random.default_rng(seed), world.model
     windows = consecutive(recordings, horizon)
@@ -62,7 +67,7 @@ def floor_gaps(world, settings, recordings, position_noise, velocity_noise, hori
     known = np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows)))
     measured = np.array([np.isfinite(w.recording.qvel[w.first]) for w in windows])
     spread, out = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0), []
-    for _ in range(draws):
+    for _ in range(DRAWS):
         noisy = cut.integrate(model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,)))
         start = cut.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds[:, None]
         start = np.where(measured, speed[every, at] + spread * rng.normal(size=start.shape), start)

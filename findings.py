@@ -17,6 +17,7 @@ import windows as cut
 from effects import JOINT_TRANSMISSIONS
 
 SAME = 0.05  # effects whose refits differ by less than this in the reported error cannot be told apart
+SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing unexplained
 NEAR = 0.3  # so near they have to come before they are refitted
 WIDER = 1.3  # for what clusters do not show: without it 88 % of the intervals of 400 trials (seed 161803) held the truth, with it 93 %
 # of an unknown force's largest: up to which it counts as none, up to which its interval must lie outside its region;
@@ -90,9 +91,9 @@ def removed(without, after, before):
     return (without - after) / max(before, 1e-12)
 
 
-def unexplained(before, after, floor):
-    """Share of the nominal model's squared error that is left above a perfect simulator's."""
-    return 1.0 if np.isinf(after) else float(np.clip((after**2 - floor**2) / max(before**2, 1e-24), 0, 1))
+def unexplained(before, after, floor, scatter):
+    """Share of the nominal model's squared error that is left above a perfect simulator's, and above what that scatters by."""
+    return 1.0 if np.isinf(after) else float(np.clip((after**2 - floor**2 - SCATTER * scatter) / max(before**2, 1e-24), 0, 1))
 
 
 def noise_by_channel(model, position_noise):
@@ -105,8 +106,9 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     noise = evidence.reporting_noise(position_noise)
     bounds = intervals(search, fit)
     held = held_out or train
-    figures = {"train": figure(world, settings, train, position_noise, velocity_noise),
-               "held_out": figure(world, settings, held, position_noise, velocity_noise)}
+    figures, scatter = {}, {}
+    for part, recordings in (("train", train), ("held_out", held)):
+        figures[part], scatter[part] = figure(world, settings, recordings, position_noise, velocity_noise)
     figures["held_out"]["horizon_s"] = cut.HORIZON
     figures["held_out"]["curve"] = evidence.curve(world, settings, held, position_noise, velocity_noise)
     if others := sensors.errors(world, settings, held):
@@ -134,7 +136,7 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     summary = {"format": 1, "verdict": "mismatch" if findings else "match",
                "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,
-               "unexplained": {"fraction": unexplained(before, after, floor),
+               "unexplained": {"fraction": unexplained(before, after, floor, scatter["held_out"]),
                                "place": {"kind": "joint", "name": hint.joint} if hint else None,
                                "depends_on": list(hint.variables) if hint else []}}
     return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
@@ -187,16 +189,17 @@ def event_finding(event, train):
 
 
 def figure(world, settings, recordings, position_noise, velocity_noise):
+    """Errors of recordings before, after and of a perfect simulator, as diagnosis.json has them; scatter of the last one's square."""
     noise, channels, out = evidence.reporting_noise(position_noise), {}, {}
     for name, s in (("before", {}), ("after", settings)):
         out[name], per_channel = evidence.prediction_error(world, s, recordings, noise)
         for channel, value in per_channel.items():
             channels.setdefault(channel, {})[name] = value
-    out["floor"], per_channel = evidence.floor_error(world, settings, recordings, position_noise, velocity_noise)
+    out["floor"], per_channel, scatter = evidence.floor_error(world, settings, recordings, position_noise, velocity_noise)
     for channel, value in per_channel.items():
         channels[channel] |= {"floor": value, "unit": unit_of(world.model, channel)}
     out["channels"] = {name: values for name, values in channels.items() if "floor" in values}  # seldom measured, a channel may have none
-    return out
+    return out, scatter
 
 
 def unit_of(model, channel):

@@ -136,8 +136,10 @@ def test_windows_that_blow_up_are_counted_beside_the_curve():
 def test_floor_is_what_noise_does_to_a_perfect_simulator():
     xml = PENDULUM.format(damping=0.05, mass=0.5)
     runs, world = [recorded(f"run{k}.csv", 20 + k, seconds=20.0) for k in range(6)], World(mujoco.MjSpec.from_string(xml))
-    floor, channels = evidence.floor_error(world, {}, runs, np.array([NOISE]), np.array([np.inf]))
-    assert floor == pytest.approx(np.sqrt(np.mean([stock_error(xml, run, NOISE) ** 2 for run in runs])), rel=0.08)
+    floor, channels, scatter = evidence.floor_error(world, {}, runs, np.array([NOISE]), np.array([np.inf]))
+    each = [stock_error(xml, run, NOISE) ** 2 for run in runs]
+    assert floor == pytest.approx(np.sqrt(np.mean(each)), rel=0.08)
+    assert np.std(each, ddof=1) / np.sqrt(len(each)) == pytest.approx(scatter, rel=0.7)  # known from six runs to 30 % itself
     assert channels["qpos:pivot"] == pytest.approx(floor * NOISE)
 
 
