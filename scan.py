@@ -21,6 +21,7 @@ WORTH, WORTH_MISFIT = 0.03, 0.1  # least fall of the squared residual that an ef
 FLEXIBLE = "inertia", "nonlinear_stiffness"  # with many ways to bend, they too come late
 PROMISING = 12  # options, at least, that are looked at anew after every addition
 COARSE = 10.0  # times the usual steps of parameters, where small ones see jumps alone
+NEARER, LEAST = 0.3, 0.01  # share of a far value, up to which a refit starts between it and the nominal one; below which not at all
 NEARLY = 1.1  # squared residual over the noise's, up to which nothing need be left
 FEW = 16  # windows, at least, of a refit that only has to tell hypotheses apart
 
@@ -221,7 +222,9 @@ class Scan:
             if n:  # in proportion to these it is linear; a ripple may be turned round, friction may not
                 start = np.r_[np.clip(amount * np.array(probe[:n]), low[:n], high[:n]), probe[n:]]
                 return tuple(start) if start[0] else None
-            return tuple(probe) if amount > 0.05 else None
+            if NEARER < amount or not np.isfinite(nominal).all() or option.candidate.effect.overrides("probes"):
+                return tuple(probe) if amount > 0.05 else None
+            return tuple(np.clip(nominal + amount * (np.array(probe) - nominal), low, high)) if amount > LEAST else None
         move = sum(v * (row - nominal) for v, row in zip(value, rows))
         start = np.clip(nominal + move, low, high)
         if np.all(np.abs(start - nominal) < 1e-3 * np.abs(move)):

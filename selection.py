@@ -16,7 +16,7 @@ from scan import WORTH, Scan, Trial, at_noise
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 PRICE = 2.0  # of a parameter, in squared residual
 FAR = 2.0  # squared residual over the noise's
-LEAST_GROWTH, VALLEY = 1.05, 2.0  # of a value that is moved on; times the squared residual, above which both ways lead up
+LEAST_GROWTH, NUDGE, VALLEY = 1.05, 1.3, 2.0  # of a value that is moved on; to begin with, in a plain search; times the squared residual, above which both ways lead up
 RENEWED, RIVAL = 3, 1.5  # of the refits, the best, whose start states are found anew; times the best's squared residual, of a rival
 DOUBTFUL = 3  # candidates that are refitted for their gain alone, where much is left
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
@@ -49,6 +49,8 @@ class Search(Scan):
                 fit, added = chosen
                 fit = shooting.renewed(self.problem, fit)
                 fit = self.drop(self.stretched(fit, added) if self.coarse else fit, added)
+        for candidate in fit.hypothesis.candidates if not self.coarse else ():
+            fit = self.stretched(fit, (candidate,), NUDGE)
         return fit
 
     def proposals(self, fit, trials, gram, score, chi2, looks=12, singles=5, doubles=2):
@@ -88,10 +90,9 @@ class Search(Scan):
                 fits[i] = shooting.renewed(problem, fits[i], most=1)
         return fits
 
-    def stretched(self, fit, added, most=12):
+    def stretched(self, fit, added, growth=2.0, most=12):
         """A fit with the values of added effects moved on together, or back, while that leaves less with start states found anew:
         where predictions jump, a step of all at once ends at the next jump."""
-        growth = 2.0
         for _ in range(most):
             if growth < LEAST_GROWTH or at_noise(self.problem, fit):
                 break

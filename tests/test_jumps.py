@@ -9,6 +9,7 @@ import pytest
 import earning
 import misfit
 import prove
+import scan
 import selection
 import starts
 import windows as cut
@@ -57,6 +58,30 @@ def test_a_value_that_stopped_at_a_jump_is_moved_on():
     new = search.stretched(fit, (damping,))
     assert fit.chi2.sum() > 3 * search.freedom and new.chi2.sum() < 1.2 * search.freedom
     assert new.hypothesis.vector[0] < 50
+
+
+def test_what_was_found_is_nudged_until_the_noise_is_reached():
+    """In a plain search too, in which a value ends where a small step seems to lead nowhere better."""
+    world, runs = World(mujoco.MjSpec.from_string(DROP.format(damping=-90))), [dropped(seed, -70) for seed in range(4)]
+    problem = misfit.Problem(world, [w for r in runs for w in cut.consecutive(r, 0.2)], np.array([NOISE]), np.array([np.inf]))
+    search, damping = selection.Search(world, problem, runs), world.candidate("contact_damping", "block")
+    fit = starts.fit(problem, misfit.Hypothesis().plus(damping, (85.0,)))
+    new = search.run(fit)
+    assert new.hypothesis.candidates == (damping,) and 70 < new.hypothesis.vector[0] < 85
+    assert scan.at_noise(problem, new) and not scan.at_noise(problem, fit)
+
+
+def test_of_a_far_value_that_says_little_only_that_part_is_a_start():
+    """Of the change that four times the mass would bring a tenth is there: a refit begins with a tenth of that mass more. Where most
+    of it is there it begins at the far value, where hardly any not at all; nor where it has no gradient."""
+    world, runs = World(mujoco.MjSpec.from_string(DROP.format(damping=-90))), [dropped(0, -90)]
+    problem = misfit.Problem(world, cut.consecutive(runs[0], 0.4), np.array([NOISE]), np.array([np.inf]))
+    search = selection.Search(world, problem, runs)
+    start = lambda option, amount: search.start_of(option, [0], range(1), [amount])
+    far = next(o for o in search.options if o.candidate == world.candidate("mass", "block") and o.directions == ((4.0,),))
+    assert start(far, 0.1) == pytest.approx((1.3,)) and start(far, 0.6) == (4.0,) and start(far, 0.005) is None and start(far, -0.2) is None
+    probe = next(o for o in search.options if o.candidate == world.candidate("joint_stop", "z"))
+    assert start(probe, 0.1) == probe.directions[0]
 
 
 def test_coarse_steps_are_that_many_times_the_usual():
