@@ -11,6 +11,7 @@ import numpy as np
 
 import misfit
 import starts
+import windows as cut
 
 WIDEST, STEPS = 0.06, 6  # of the clock's error; steps of the search, each of which halves what is left
 MANY = 4  # findings that are needed to stand in for a clock
@@ -35,8 +36,8 @@ def suspect(problem, fit, largest):
 
 def left(problem, ratio, hypothesis):
     """Squared residual of a hypothesis with the recordings' time multiplied by ratio."""
-    scaled = {id(w.recording): replace(w.recording, time=w.recording.time * ratio) for w in problem.windows}
+    scaled = {r: replace(r, time=r.time * ratio) for r in cut.recordings_of(problem.windows)}
     other = problem.subset(np.arange(len(problem.windows)))
-    other.windows = [w._replace(recording=scaled[id(w.recording)]) for w in problem.windows]
+    other.windows = [w._replace(recording=scaled[w.recording]) for w in problem.windows]
     other.guess_qvel = problem.guess_qvel / ratio
     return starts.fit(other, hypothesis).chi2.sum()

@@ -108,11 +108,11 @@ def elsewhere(search, fit, windows):
 
     Where there is but one recording: as its other thirds say.
     """
-    recordings = list({id(w.recording): w.recording for w in [*search.problem.windows, *windows]}.values())
+    recordings = cut.recordings_of([*search.problem.windows, *windows])
 
     def block(w):
         if len(recordings) > 1:
-            return next(i for i, r in enumerate(recordings) if r is w.recording)
+            return recordings.index(w.recording)
         return min(3 * w.first // len(w.recording.time), 2)
 
     slope, moves = search.slopes(fit)

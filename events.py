@@ -14,6 +14,7 @@ import numpy as np
 import misfit
 import scores
 import shooting
+import windows as cut
 
 LEVEL = 1e-3  # false-alarm rate, shared between all intervals and effects
 CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the interval must explain
@@ -67,7 +68,6 @@ def find(world, problem, fit):
     usual = np.quantile(scan.chi2 / rows, 0.3) * (rows + 2 * np.sqrt(2 * rows))  # with the scatter of white noise
     excess = (scan.chi2 - usual).clip(0).sum()
     best, everything = None, []
-    recordings = list({id(w.recording): w.recording for w in problem.windows}.values())
     for (_, timed), columns, step, base in zip(pairs, where, moves, bases):
         keep = [c for c in columns if scan.gram[:, c, c].sum() > shooting.UNSEEN]
         if not keep:
@@ -75,7 +75,7 @@ def find(world, problem, fit):
         score, gram = scan.score[:, keep], scan.gram[:, keep][:, :, keep]
         alone = np.array([s @ scores.solve_small(g, s) for s, g in zip(score, gram)])
         spread = max(np.quantile(alone, 0.3) / USUAL[len(keep)], 1.0)  # what windows without an event show
-        for r in recordings:
+        for r in cut.recordings_of(problem.windows):
             mine = np.array([i for i, w in enumerate(problem.windows) if w.recording is r])
             for a in range(len(mine)):
                 for b in range(a, min(len(mine), a + max(1, int(LONGEST * len(mine))))):

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 import evidence
+import misfit
 import scores
 import selection
 import sensors
 import shooting
+import starts
 import windows as cut
 from effects import JOINT_TRANSMISSIONS
 
@@ -106,9 +108,8 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     noise = evidence.reporting_noise(position_noise)
     bounds = intervals(search, fit)
     held = held_out or train
-    figures, scatter = {}, {}
-    for part, recordings in (("train", train), ("held_out", held)):
-        figures[part], scatter[part] = figure(world, settings, recordings, position_noise, velocity_noise)
+    figures = {"train": figure(world, settings, train, position_noise, velocity_noise)[0]}
+    figures["held_out"], scatter = figure(world, settings, held, position_noise, velocity_noise)
     figures["held_out"]["horizon_s"] = cut.HORIZON
     figures["held_out"]["curve"] = evidence.curve(world, settings, held, position_noise, velocity_noise)
     if others := sensors.errors(world, settings, held):
@@ -116,6 +117,7 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     before, after, floor = (figures["held_out"][k] for k in ("before", "after", "floor"))
     findings = []
     xml, written = world.corrected_xml(settings)
+    p_values = {c: search.significance(fit, c)[0] for c in fit.hypothesis.candidates}
     for candidate, values in fit.hypothesis.effects:
         without = evidence.prediction_error(world, fit.hypothesis.minus(candidate).settings, held, noise)[0]
         curve = candidate.effect.name == "unknown"
@@ -124,7 +126,7 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
             "effect": candidate.effect.name, "place": place_of(candidate),
             "parameters": parameters_of(candidate, values, bounds[candidate]),
             "evidence": {"held_out_error_removed": removed(without, after, before),
-                         "p_value": search.significance(fit, candidate)[0]},
+                         "p_value": p_values[candidate]},
             "depends_on": list(left.variables) if curve else depends_on(model, candidate),
             "when": region(candidate.effect, values, bounds[candidate], travel(model, train, candidate)) if curve else None,
             "written_as": written[candidate],
@@ -136,10 +138,10 @@ def assemble(world, train, held_out, fit, search, possible, left, hint, event, r
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     summary = {"format": 1, "verdict": "mismatch" if findings else "match",
                "noise": noise_by_channel(model, position_noise), "findings": findings, "fit": figures,
-               "unexplained": {"fraction": unexplained(before, after, floor, scatter["held_out"]),
+               "unexplained": {"fraction": unexplained(before, after, floor, scatter),
                                "place": {"kind": "joint", "name": hint.joint} if hint else None,
                                "depends_on": list(hint.variables) if hint else []}}
-    return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit), evidence.traces(world, settings, held),
+    return Diagnosis(summary, xml, world, settings, ranking_rows(ranking, fit, search, p_values), evidence.traces(world, settings, held),
                      train, held)
 
 
@@ -245,14 +247,16 @@ def also_possible(search, fit, train, noise, candidate, others, most=3):
     return out
 
 
-def ranking_rows(trials, fit):
-    """Best option of every candidate in the first scan: share of the squared residual it removes, and its p-value."""
-    rows, seen = [], set()
+def ranking_rows(trials, fit, search, p_values):
+    """What every candidate removes alone of the squared residual, most first: as the first look has it, or refitted where that
+    passed over what a fit holds. p_values: of the latter."""
+    best = {}
     for t in trials:
-        c = t.option.candidate
-        if c in seen:
-            continue
-        seen.add(c)
-        rows.append({"effect": c.effect.name, "place": place_of(c), "error_removed": float(t.gain / t.chi2), "p_value": t.p_value,
-                     "chosen": c in fit.hypothesis.candidates})
-    return rows[:40]
+        best.setdefault(t.option.candidate, (t.gain / t.chi2, t.p_value))
+    late = [effect for effect in fit.hypothesis.effects if effect[0] not in best]
+    if late:
+        bare = starts.fit(search.small, misfit.Hypothesis())
+        alone = shooting.solve(search.small, [misfit.Hypothesis((effect,)) for effect in late], bare, iterations=4)
+        best |= {c: (1 - f.chi2.sum() / bare.chi2.sum(), p_values[c]) for (c, _), f in zip(late, alone)}
+    return [{"effect": c.effect.name, "place": place_of(c), "error_removed": float(best[c][0]), "p_value": best[c][1]}
+            for c in sorted(best, key=lambda c: -best[c][0])]

@@ -113,7 +113,7 @@ class Problem:
         self.rows = int(self.weight.astype(bool).sum())
         self.far_apart = far_apart(w.recording for w in self.windows)
         self.size = self.weight[0].size + 2 * nv
-        self.key = tuple((id(r), *rows) for r, *rows in self.windows), position_noise.tobytes(), np.asarray(velocity_noise).tobytes()
+        self.key = tuple(self.windows), position_noise.tobytes(), np.asarray(velocity_noise).tobytes()
 
     @property
     def taken(self):

@@ -23,9 +23,9 @@ from units import suspect
 LARGEST = {"time": 1e300, "qpos": 1e6, "qvel": 1e6, "ctrl": 1e9, "sensor": 1e12}  # beyond these no unit explains a value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recording:
-    """One continuous run. NaN: not measured. Columns stand in MuJoCo's order.
+    """One continuous run, equal to itself alone. NaN: not measured. Columns stand in MuJoCo's order.
 
     name: file name; time (T,) s, increasing; qpos (T, nq) m or rad; qvel (T, nv), all NaN when absent;
     ctrl (T, nu), without NaN; sensors: name -> (T, k). start: the row from which on it is predicted where it is held out;

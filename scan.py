@@ -103,7 +103,7 @@ class Scan:
         self.places = len({o.candidate for o in self.options})
         labels = scores.clusters(problem.windows)
         count = labels.max() + 1
-        many = len({id(w.recording) for w in problem.windows}) >= scores.MANY  # they are the clusters then, whole
+        many = len(cut.recordings_of(problem.windows)) >= scores.MANY  # they are the clusters then, whole
         self.pieces = 1 if many or count >= 16 else min(-(-16 // count), max(problem.weight.shape[1] // 4, 1))
         if self.pieces > 1:
             labels = np.arange(len(problem.windows) * self.pieces)

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+import windows as cut
 
 LITTLE = 0.05  # of a column's size, seen outside a cluster, below which its value there counts as not known
 
@@ -63,11 +64,8 @@ def t_quantile(degrees, level=0.975):
 
 def clusters(windows, most=30):
     """Cluster label of every window: its recording where recordings are many, else a stretch of neighbouring windows."""
-    recordings = []
-    for w in windows:
-        if not any(w.recording is r for r in recordings):
-            recordings.append(w.recording)
-    owner = np.array([next(i for i, r in enumerate(recordings) if w.recording is r) for w in windows])
+    recordings = cut.recordings_of(windows)
+    owner = np.array([recordings.index(w.recording) for w in windows])
     if len(recordings) >= MANY:
         return owner
     labels, at = np.zeros(len(windows), int), 0

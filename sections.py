@@ -20,6 +20,7 @@ from page import SCRIPT, STYLE
 
 E = html.escape
 PER_PERIOD, PER_CURVE = 40, 201  # rows of a saved sine per period, and of another saved curve
+MOST = 15  # candidates that are shown, besides those in the diagnosis
 
 
 def html_page(diagnosis):
@@ -258,10 +259,12 @@ def _unexplained(diagnosis):
 def _ranking(diagnosis):
     rows = []
     chosen = {(f["effect"], f["place"]["kind"], f["place"]["name"]) for f in diagnosis.summary["findings"]}
-    for candidate in diagnosis.ranking[:15]:
+    for rank, candidate in enumerate(diagnosis.ranking):
         place, removed = candidate["place"], candidate["error_removed"]
-        share = 0 if removed is None or not math.isfinite(removed) else min(1, max(0, removed))
         found = (candidate["effect"], place["kind"], place["name"]) in chosen
+        if rank >= MOST and not found:
+            continue
+        share = 0 if removed is None or not math.isfinite(removed) else min(1, max(0, removed))
         bar = f'<span class="bar"><i style="width:{100 * share:.0f}%"></i></span> {100 * share:.0f} %'
         name = f'{E(wording.effect_words(candidate["effect"]))}<small>{E(wording.place_words(place))}</small>'
         rows.append(["*" * found + name, bar, E(wording.p_value(candidate["p_value"]))])

@@ -16,7 +16,8 @@ from scan import WORTH, Scan, Trial, at_noise
 ALPHA = 0.005  # false-alarm rate of one search, shared between all candidates
 PRICE = 2.0  # of a parameter, in squared residual
 FAR = 2.0  # squared residual over the noise's
-LEAST_GROWTH, NUDGE, VALLEY = 1.05, 1.3, 2.0  # of a value that is moved on; to begin with, in a plain search; times the squared residual, above which both ways lead up
+LEAST_GROWTH, NUDGE = 1.05, 1.3  # of a value that is moved on; to begin with, in a plain search
+VALLEY = 2.0  # times the squared residual, above which both ways lead up
 RENEWED, RIVAL = 3, 1.5  # of the refits, the best, whose start states are found anew; times the best's squared residual, of a rival
 DOUBTFUL = 3  # candidates that are refitted for their gain alone, where much is left
 HOPE = 0.05  # p-value, in the linear look, of a start for a candidate of which another start is significant
@@ -174,7 +175,7 @@ class Search(Scan):
 
     def shared(self, fit, new, worth):
         """Whether more than one recording gains, where there are several: what one run alone shows is no lasting effect."""
-        owners = [id(w.recording) for w in self.problem.windows]
+        owners = [w.recording for w in self.problem.windows]
         before, after = ({o: f.chi2[[i for i, p in enumerate(owners) if p == o]].sum() for o in owners} for f in (fit, new))
         if len(before) < 3:
             return True

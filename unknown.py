@@ -71,8 +71,8 @@ class Variables:
 
     def __init__(self, problem):
         model = problem.model
-        known = {id(w.recording): cut.states(model, w.recording) for w in problem.windows}
-        rows = [(known[id(w.recording)], w) for w in problem.windows]
+        known = {r: cut.states(model, r) for r in cut.recordings_of(problem.windows)}
+        rows = [(known[w.recording], w) for w in problem.windows]
         self.position = np.array([s[0][w.first:w.last + 1].mean(0) for s, w in rows])
         step = np.array([cut.difference(model, s[0][w.first], s[0][w.last]) for s, w in rows])
         self.time = np.array([0.5 * (w.recording.time[w.first] + w.recording.time[w.last]) for w in problem.windows])
@@ -95,7 +95,7 @@ def curves(world, problem, v, joint, few):
     few (W,): windows in which most is left; one that acts only where they lie has its knots there.
     """
     model, name = problem.model, cut.joint_name(problem.model, joint)
-    known = [cut.states(model, r) for r in {id(w.recording): w.recording for w in problem.windows}.values()]
+    known = [cut.states(model, r) for r in cut.recordings_of(problem.windows)]
     seen = {f"position:{name}": np.concatenate([s[0][:, model.jnt_qposadr[joint]] for s in known]),
             f"velocity:{name}": np.concatenate([s[1][:, model.jnt_dofadr[joint]] for s in known])}
     seen |= {control(model, a): v.control[:, model.actuator_ctrladr[a]] for a in drives(model, joint)}

@@ -81,6 +81,11 @@ def integrate(model, qpos, step):
     return out
 
 
+def recordings_of(windows):
+    """The recordings that windows were cut from, each once."""
+    return list(dict.fromkeys(w.recording for w in windows))
+
+
 def sampling(recordings):
     """Usual time between the rows of recordings, s."""
     return np.median([np.median(np.diff(r.time)) for r in recordings])
@@ -163,11 +168,8 @@ def consecutive(recording, horizon=HORIZON, first=0, end=None):
 
 def recorded_starts(model, windows):
     """Start states as the error defines them: qpos (W, nq), qvel (W, nv)."""
-    known = {}
-    for w in windows:
-        if id(w.recording) not in known:
-            known[id(w.recording)] = states(model, w.recording)
-    pick = [(known[id(w.recording)], w.first) for w in windows]
+    known = {r: states(model, r) for r in recordings_of(windows)}
+    pick = [(known[w.recording], w.first) for w in windows]
     return np.array([s[0][i] for s, i in pick]), np.array([s[1][i] for s, i in pick])
 
 

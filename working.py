@@ -105,10 +105,10 @@ class Working:
 
         changed: ((actuator, ((effect, values), ...)), ...), the effects on the way to them.
         """
-        key = id(recording), start, step, count, changed
+        key = recording, start, step, count, changed
         if key in self.controls:
             self.controls.move_to_end(key)
-            return self.controls[key][0]
+            return self.controls[key]
         m, average = self.nominal, runge_kutta(self.nominal)
         if changed:
             ctrl = self.control(recording, start, step, count).copy()
@@ -124,10 +124,10 @@ class Working:
             for a in range(m.nactuator):
                 for u in range(m.actuator_ctrladr[a], m.actuator_ctrladr[a] + m.actuator_ctrlnum[a]):
                     ctrl[:, u] = self.signal(recording, a, u).sample(start, step, count, average)
-        self.controls[key] = ctrl, recording  # which keeps its id from being given away
+        self.controls[key] = ctrl
         self.control_bytes += ctrl.nbytes
         while self.control_bytes > COPY_BYTES and len(self.controls) > 1:
-            self.control_bytes -= self.controls.popitem(last=False)[1][0].nbytes
+            self.control_bytes -= self.controls.popitem(last=False)[1].nbytes
         return ctrl
 
     def signal(self, recording, a, u):
@@ -155,8 +155,7 @@ class Working:
 
     def _muscle(self, recording, a):
         """Time and activation (n,) of muscle a over a recording, without delay, from its first control held for long."""
-        time, _, act = self.muscles.get((id(recording), a), (None,) * 3)
-        if act is None:
+        if (recording, a) not in self.muscles:
             h, m = self.nominal.opt.timestep, self.nominal
             time = np.arange(recording.time[0], recording.time[-1] + h, h)
             ctrl = np.clip(recording.ctrl[:, m.actuator_ctrladr[a]], 0.0, 1.0)
@@ -164,5 +163,5 @@ class Working:
             act = np.full(len(time), ctrl[0])
             for k in range(len(time) - 1):
                 act[k + 1] = act[k] + h * mujoco.mju_muscleDynamics(ctrl[k], act[k], m.actuator_dynprm[a, :3])
-            self.muscles[id(recording), a] = time, recording, act  # the recording too, so that its id stays its own
-        return time, act
+            self.muscles[recording, a] = time, act
+        return self.muscles[recording, a]

@@ -653,6 +653,8 @@ def test_a_periodic_force_is_found_with_its_frequency(hertz):
     begin, quarter = [p["at"] for p in finding["parameters"]]
     assert 0.25 / (quarter - begin) == pytest.approx(hertz, abs=0.02)
     assert np.hypot(*[p["value"] for p in finding["parameters"]]) == pytest.approx(0.1, rel=0.1)
+    [alone] = [row["error_removed"] for row in diagnosis.ranking if row["effect"] == "unknown"]  # the first look knows no such force
+    assert alone == max(row["error_removed"] for row in diagnosis.ranking) and alone > 0.9
 
 
 @given(st.integers(0, 10**6))

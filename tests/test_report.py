@@ -474,6 +474,14 @@ def test_page_says_it_all(diagnosis):
         assert words in page, words
 
 
+def test_what_was_found_is_among_the_candidates_whatever_its_rank(diagnosis):
+    found, other = diagnosis.ranking
+    weak = [{**other, "effect": "gain", "place": {"kind": "actuator", "name": f"motor{k}"}, "error_removed": 0.7} for k in range(20)]
+    diagnosis.ranking = [*weak, found]
+    page = sections.html_page(diagnosis).partition("Candidates")[2]
+    assert "motor14" in page and "motor15" not in page and "Coulomb friction<small>" in page
+
+
 def test_where_and_when_in_words():
     assert wording.when_words({"qpos:elbow": [0.4, 0.8]}) == ", where the position of elbow is between 0.400 and 0.800"
     assert wording.when_words({"qvel:elbow": [0, 2]}) == ", where the velocity of elbow is between 0 and 2.00"
