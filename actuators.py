@@ -5,8 +5,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from effects import (HINGE, HUGE, JOINT_TRANSMISSION, SLIDE, Effect, Parameter, catalogue, constant_force, explicit_inertia, runge_kutta,
-                     turns)
+from effects import (BALL, HINGE, HUGE, JOINT_TRANSMISSION, JOINT_TRANSMISSIONS, SLIDE, Effect, Parameter, catalogue, constant_force,
+                     explicit_inertia, runge_kutta)
 
 
 class ActuatorEffect(Effect):
@@ -45,8 +45,8 @@ class ActuatorEffect(Effect):
     @staticmethod
     def unit(model, i):
         """Unit of its force."""
-        on_joint = model.actuator_trntype[i] == JOINT_TRANSMISSION
-        return 'N·m' if on_joint and turns(model, model.actuator_trnid[i, 0]) else 'N'
+        on_joint = model.actuator_trntype[i] in JOINT_TRANSMISSIONS
+        return 'N·m' if on_joint and model.jnt_type[model.actuator_trnid[i, 0]] in (HINGE, BALL) else 'N'
 
     @staticmethod
     def general(spec, model, i):

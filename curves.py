@@ -87,7 +87,9 @@ class Unknown(JointEffect):
         if abs(basis @ fit - y).max() > 0.05 * np.ptp(y):
             return 'none'
         field[:] = np.array(field) - fit[1:]
-        constant_force(spec, f'unknown:{joint.name}', fit[0], JOINT_TRANSMISSION, joint.name)
+        names = [f'unknown:{joint.name}', *(f'unknown:{joint.name}:{n}' for n in range(2, len(spec.actuators) + 3))]
+        taken = {actuator.name for actuator in spec.actuators}  # by a corrected model's own
+        constant_force(spec, next(name for name in names if name not in taken), fit[0], JOINT_TRANSMISSION, joint.name)
         return 'mjcf'
 
 

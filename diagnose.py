@@ -110,9 +110,18 @@ def _recordings(recordings, held_out, model):
     for path in further:
         if os.path.realpath(path) in where:
             raise recorded.RecordingError(f"{path}: given both for fitting and as held out; give it once")
-    train, held = (_loaded(some, paths, model) for some, paths in ((given, files), (more, further)))
+    train, held = (_apart(_loaded(some, paths, model)) for some, paths in ((given, files), (more, further)))
     taken = {recording.name for recording in train}
     return train, [dataclasses.replace(r, name=f"held out {r.name}") if r.name in taken else r for r in held]
+
+
+def _apart(recordings):
+    """The same under names that differ: a second "run" becomes "run (2)"."""
+    names = []
+    for r in recordings:
+        every = [r.name, *(f"{r.name} ({n})" for n in range(2, len(recordings) + 1))]
+        names.append(next(name for name in every if name not in names))
+    return [dataclasses.replace(r, name=name) for r, name in zip(recordings, names)]
 
 
 def _loaded(given, paths, model):
@@ -140,7 +149,7 @@ def _runs(model, recordings):
                        if data.warning[getattr(mujoco.mjtWarning, name)].number]
                 if bad:
                     failed += 1
-                    example = example or f"from {recording.name} at {recording.time[row]:.4g} s"
+                    example = example or f"from {recording.name} at {recording.time[row]:.12g} s"
                     break
             tried += 1
     if failed > tried / 2:
@@ -160,8 +169,8 @@ def main(argv=None):
     nominal = parser.add_mutually_exclusive_group(required=True)
     nominal.add_argument("--model", help="MJCF file of the nominal simulator")
     nominal.add_argument("--env", help="gymnasium id of a MuJoCo environment, instead of --model")
-    parser.add_argument("--recordings", nargs="+", required=True, metavar="FILE", help="CSV, NPZ or Minari recordings to fit")
-    parser.add_argument("--held-out", nargs="+", metavar="FILE", help="recordings that are only predicted, never fitted")
+    parser.add_argument("--recordings", nargs="+", action="extend", required=True, metavar="FILE", help="CSV, NPZ or Minari recordings to fit")
+    parser.add_argument("--held-out", nargs="+", action="extend", metavar="FILE", help="recordings that are only predicted, never fitted")
     parser.add_argument("--out", required=True, metavar="FOLDER", help="where the report is written")
     bar = None
 

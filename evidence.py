@@ -45,16 +45,15 @@ def floor_error(world, settings, recordings, position_noise, velocity_noise):
     return float(np.sqrt(total.sum() / count)), per_channel, float(scatter)
 
 
-def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, most=300, seed=0):
-    """What a perfect simulator would miss in at most `most` windows: (DRAWS W, T, nv), NaN where nothing was measured.
+def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, seed=0):
+    """What a perfect simulator would miss in the windows, or some of many: (DRAWS W, T, nv), NaN where nothing was measured.
 
     The corrected model from start states fitted to the first 0.3 s, from one row before each window on, stands for the
     truth. It is measured anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
     by differences; DRAWS times, for noise alone makes this vary.
     """
     rng, model = np.random.default_rng(seed), world.model
-    windows = consecutive(recordings, horizon)
-    windows = windows[:: -(-len(windows) // most)]
+    windows = sparse(consecutive(recordings, horizon))
     early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
     ends = [int(np.searchsorted(w.recording.time, w.recording.time[w.first] + cut.HORIZON * (1 + 1e-6), "right")) - 1 for w in windows]
     begun = [w._replace(last=max(min(w.last, end), w.first + 1)) for w, end in zip(early, ends)]
@@ -90,24 +89,44 @@ def curve(world, settings, recordings, position_noise, velocity_noise, longest=3
     """
     noise = reporting_noise(position_noise)
     windows = consecutive(recordings, longest)
-    length = max(w.last - w.first for w in windows) + 1
-    rows = np.unique(np.linspace(1, length - 1, min(points, length - 1)).round().astype(int))
-    sample = np.median([(w.recording.time[w.last] - w.recording.time[w.first]) / (w.last - w.first) for w in windows])
+    seconds = [w.recording.time[w.first:w.last + 1] - w.recording.time[w.first] for w in windows]
+    sample = np.median([s[-1] / (len(s) - 1) for s in seconds])
+    most = max(1, round(max(s[-1] for s in seconds) / sample))
     measured = cut.measured(windows)
     known = np.isfinite(cut.difference(world.model, measured, measured))
     predicted = {name: predict(world, s, windows)[0] for name, s in (("before", {}), ("after", settings))}
     gaps = {name: cut.position_residual(world.model, windows, qpos) for name, qpos in predicted.items()}
     gaps["floor"] = floor_gaps(world, settings, recordings, position_noise, velocity_noise, longest)
     out = []
-    for row in rows:
-        entry = {"seconds": float(row * sample)}
-        blown = {name: int((known[:, row] & ~np.isfinite(gaps[name][:, row])).any(1).sum()) for name in predicted}
+    for time in sample * np.unique(np.linspace(1, most, min(points, most)).round()):
+        rows = np.array([_row_at(s, time) for s in seconds])  # recordings may be sampled at different rates
+        measured_then = _at(known, rows)
+        entry = {"seconds": float(time)}
+        blown = {name: int((measured_then & ~np.isfinite(_at(gaps[name], rows))).any(1).sum()) for name in predicted}
         if any(blown.values()):
-            entry["blown_up"] = {**blown, "of": int(known[:, row].any(1).sum())}
+            entry["blown_up"] = {**blown, "of": int(measured_then.any(1).sum())}
         with np.errstate(invalid="ignore", over="ignore"):
-            entry |= {name: _rms(gap[:, row] / noise) if row < gap.shape[1] else None for name, gap in gaps.items()}
+            entry |= {name: _rms(_at(gaps[name], rows) / noise) for name in predicted}
+            entry["floor"] = _rms(_at(gaps["floor"], np.tile(sparse(rows), DRAWS)) / noise)
         out.append(entry)
     return out
+
+
+def _row_at(seconds, time):
+    """The row of a window that stands nearest to a time after its start; -1 where the window has ended by then."""
+    row = int(np.argmin(np.abs(seconds - time)))
+    return row if row and np.abs(seconds[row] - time) <= 0.51 * np.diff(seconds).max() else -1
+
+
+def _at(values, rows):
+    """(W, T, nv) at one row of every window, of those that have it: (V, nv)."""
+    having = np.flatnonzero((rows >= 0) & (rows < values.shape[1]))
+    return values[having, rows[having]]
+
+
+def sparse(windows, most=300):
+    """Every one of a list, or every second, third ... of a long one."""
+    return windows[:: -(-len(windows) // most)]
 
 
 def _rms(x):

@@ -12,6 +12,8 @@ import numpy as np
 
 import wording
 
+FAR = 1e4  # of an axis from zero, over its length: its ticks count from its beginning then
+
 
 @dataclass(frozen=True)
 class Series:
@@ -75,6 +77,8 @@ def chart(series, x_label, y_label, width=380, height=230, log_y=False, zero=Fal
         pad = 0.06 * (y1 - y0) or abs(y0) * 0.1 or 1.0
         y0, y1 = (y0 if zero and y0 == 0 else y0 - pad), y1 + pad
     left, right, top, bottom = 52, 10, 10, 40
+    shift = float(math.floor(x0)) if abs(x0) > FAR * (x1 - x0) else 0.0
+    x_label += f", from {shift:.15g} on" if shift else ""
 
     def px(x):
         return left + (np.asarray(x, float) - x0) / (x1 - x0) * (width - left - right)
@@ -92,7 +96,7 @@ def chart(series, x_label, y_label, width=380, height=230, log_y=False, zero=Fal
     for t in ticks(x0, x1, 5 if width < 500 else 9):
         x = float(px(t))
         parts.append(f'<path class="grid" d="M{x:.1f} {top}V{height - bottom}"/>'
-                     f'<text class="tick" x="{x:.1f}" y="{height - bottom + 14}" text-anchor="middle">{_tick(t)}</text>')
+                     f'<text class="tick" x="{x:.1f}" y="{height - bottom + 14}" text-anchor="middle">{_tick(t - shift)}</text>')
     for s in series:
         x, y = np.asarray(s.x, float), np.asarray(s.y, float)
         if s.kind == "band":

@@ -5,6 +5,7 @@
     write_table("rows.csv", ("name", "value"), [{"name": "mass", "value": 1.0}])
 """
 import csv
+import errno
 import io
 import os
 
@@ -25,6 +26,9 @@ def write_together(files):
     """
     waiting = {}
     try:
+        for path in files:
+            if os.path.isdir(path):
+                raise IsADirectoryError(errno.EISDIR, "a folder has that name", path)
         for path, data in files.items():
             folder, name = os.path.split(os.fspath(path))
             partial = os.path.join(folder, f".{name}.{os.getpid()}.partial")
@@ -35,10 +39,12 @@ def write_together(files):
                 os.fsync(stream.fileno())
         for partial, path in waiting.items():
             os.replace(partial, path)
-    except OSError as error:
+    except BaseException as error:  # whoever stops the program leaves nothing behind either
         for partial in waiting:
             if os.path.exists(partial):
                 os.remove(partial)
+        if not isinstance(error, OSError):
+            raise
         raise WriteError(f"cannot write {path}: {error.strerror or error}; free some space or choose another --out") from None
 
 

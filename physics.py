@@ -219,7 +219,8 @@ class SensorBias(SensorEffect):
             return 'measurement'
         joint, offset = spec.joint(model.joint(i).name), authored(spec, model, i, values[0])
         joint.ref, joint.springref = joint.ref + offset, joint.springref + offset
-        joint.range = [bound + offset for bound in joint.range]
+        if model.jnt_limited[i] or joint.limited == mujoco.mjtLimited.mjLIMITED_TRUE:  # by a stop that was found
+            joint.range = [bound + offset for bound in joint.range]
         for actuator in spec.actuators:  # servos and magnets go on acting on the true position
             if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == joint.name:
                 shift = actuator.gear[0] * values[0]

@@ -332,13 +332,16 @@ def _minari(path, model):
         env = dataset.recover_environment()
         dt = float(env.unwrapped.dt)
         env.close()
-        episodes = list(dataset.iterate_episodes())
+        episodes = [(episode.id, _episode(path, episode, model, dt)) for episode in dataset.iterate_episodes()]
+    except RecordingError:
+        raise
     except Exception as error:  # whatever an optional package and a broken folder can raise
         raise RecordingError(f"{path}: not a readable Minari dataset ({error}); give its id, its folder, or CSV "
                              "files") from None
+    if not episodes:
+        raise RecordingError(f"{path}: the dataset holds no episodes; record some or leave it out")
     name = os.path.basename(os.path.normpath(path))
-    return [(f"{path} episode {episode.id}", f"{name}:{episode.id}",
-             by_column(path, _episode(path, episode, model, dt), model), 0) for episode in episodes]
+    return [(f"{path} episode {number}", f"{name}:{number}", by_column(path, arrays, model), 0) for number, arrays in episodes]
 
 
 def _episode(path, episode, model, dt):

@@ -11,6 +11,7 @@ A Minari dataset (id or folder) gives one recording per episode. Units are SI: s
 
 Row t is the state at time[t] and the control held from time[t] to time[t+1]. NaN, or an empty cell, is "not measured".
 """
+import math
 import os
 from dataclasses import dataclass, field, replace
 
@@ -60,14 +61,17 @@ def load(paths, model):
     for path, where in zip(paths, real):
         if real.count(where) > 1:
             raise RecordingError(f"{path}: given twice; name each recording once")
-    short = [os.path.basename(where) for where in real]
-    recordings = []
-    for path, where in zip(paths, real):
-        for label, name, columns, first_row in read(path, model):
-            if short.count(os.path.basename(where)) > 1:  # run1/data.csv, run2/data.csv: findings need to tell them apart
-                name = os.path.join(os.path.basename(os.path.dirname(where)), name)
-            recordings.append(_recording(label, name, columns, model, first_row))
-    return recordings
+    return [_recording(label, folders + name, columns, model, first_row) for path, folders in zip(paths, _folders(paths))
+            for label, name, columns, first_row in read(path, model)]
+
+
+def _folders(paths):
+    """What has to stand in front of the last part of each path to tell it from the others': "", or "run1/" of run1/data.csv."""
+    parts, out = [os.path.abspath(path).split(os.sep) for path in paths], []
+    for mine in parts:
+        most = next(n for n in range(1, len(mine) + 1) if sum(other[-n:] == mine[-n:] for other in parts) == 1)
+        out.append("".join(f"{part}/" for part in mine[-most:-1]))
+    return out
 
 
 def accepted(recording, model):
@@ -107,7 +111,7 @@ def _recording(path, name, columns, model, first_row):
         word = "repeats" if time[row] == time[row - 1] else "runs backward from"
         do = ("write time with more digits" if word == "repeats" and back.mean() > 0.2 and np.ptp(time) > 0 else
               "remove repeated rows, sort them, and put separate runs into separate files")
-        raise RecordingError(f"{path}: row {row + first_row}, column 'time': {time[row]:.9g} {word} {time[row - 1]:.9g}; {do}")
+        raise RecordingError(f"{path}: row {row + first_row}, column 'time': {time[row]:.15g} {word} {time[row - 1]:.15g}; {do}")
     arrays = {"qpos": np.full((len(time), model.nq), np.nan), "qvel": np.full((len(time), model.nv), np.nan),
               "ctrl": np.zeros((len(time), model.nu))}
     sensors = {}
@@ -146,6 +150,7 @@ def _quaternions(path, qpos, model, first_row):
 
 # --- plausibility ---------------------------------------------------------------------------------------------------
 
+HIGH, FAST = 10, 8.0  # order of differences that leave nothing of fast motion; noises, of which white noise spans 4.7 between the quantiles
 ENOUGH = "10 s of varied motion sampled at 50 Hz or more is a good start"
 
 
@@ -225,9 +230,14 @@ def _leaves_noise(values):
     """Whether (T,) measured values leave the band of their own noise (five sigma, from second differences) for good."""
     if len(values) < 5:
         return False
-    noise = np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6))
+    by_differences = lambda order: np.median(np.abs(np.diff(values, order))) / (0.6745 * np.sqrt(math.comb(2 * order, order)))
+    noise = by_differences(2)
     smooth = np.convolve(values, np.ones(5) / 5, "valid")
-    return np.ptp(smooth) > 5 * noise + 1e-9 * (1 + np.abs(values).max())
+    least = 1e-9 * (1 + np.abs(values).max())
+    if np.ptp(smooth) > 5 * noise + least:
+        return True
+    low, high = np.quantile(values, (0.01, 0.99))  # a motion of few rows per period looks like noise to second differences alone
+    return len(values) > 2 * HIGH and high - low > FAST * by_differences(HIGH) + least
 
 
 def _check_time(recording, model, warn):
@@ -249,11 +259,11 @@ def _check_time(recording, model, warn):
                              f"{usual:.3g} s); no velocity can be formed from these two, remove one")
     row = int(np.argmax(steps))
     if steps[row] > max(20 * usual, 0.1):
-        raise RecordingError(f"{where}: gap of {steps[row]:.3g} s after data row {row + 1}, at {recording.time[row]:.6g} s "
+        raise RecordingError(f"{where}: gap of {steps[row]:.3g} s after data row {row + 1}, at {recording.time[row]:.12g} s "
                              f"(rows are {usual:.3g} s apart); split the file there, or write the missing rows with nan "
                              "positions and their control")
     if steps[row] > 5 * usual:
-        warn(recording, f"gap of {steps[row]:.3g} s after {recording.time[row]:.6g} s, rows are {usual:.3g} s apart")
+        warn(recording, f"gap of {steps[row]:.3g} s after {recording.time[row]:.12g} s, rows are {usual:.3g} s apart")
 
 
 def _check_values(recording, model, warn):
@@ -281,9 +291,9 @@ def _check_values(recording, model, warn):
             single = model.jnt_type[joint] not in WIDTHS
             hinge = single and model.jnt_type[joint] == 3
             limited, span = single and model.jnt_limited[joint], model.jnt_range[joint]
-            jumps = np.abs(np.diff(values))
-            row = int(np.argmax(jumps))
-            speed = np.percentile(jumps / np.diff(recording.time[~missing]), 90)
+            jumps, steps = np.abs(np.diff(values)), np.diff(recording.time[~missing])
+            row = int(np.argmax(np.where(steps < 2 * np.median(steps), jumps, 0.0)))  # who turns on while not measured jumps too
+            speed = np.percentile(jumps / steps, 90)
             if speed > (3000 if hinge else 340):
                 raise RecordingError(f"{where}: moves at {speed:.3g} {'rad/s' if hinge else 'm/s'} most of the time; "
                                      f"is it in {'degrees' if hinge else 'mm'}? convert it to {'rad' if hinge else 'm'}, "

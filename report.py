@@ -90,7 +90,7 @@ def _csv(curve):
     factor, levels = curve["factor"], (-1.0, 1.0) if curve["factor"] else (1.0,)
     head = [curve["variable"]] + ([_multiplier(factor)] if factor else []) + ["force"]
     rows = [[x, *([level] if factor else []), level * force] for level in levels for x, force in zip(curve["x"], curve["force"])]
-    return "\n".join([",".join(head), *(",".join(f"{value:.9g}" for value in row) for row in rows)]) + "\n"
+    return "\n".join([",".join(head), *(",".join(f"{value:.15g}" for value in row) for row in rows)]) + "\n"
 
 
 def _multiplier(factor):

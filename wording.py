@@ -77,7 +77,7 @@ def finding_words(finding):
     parameters = [p for p in parameters if p["value"] != p["nominal"]] or parameters
     if not parameters:
         return f"{place}: {effect}"
-    if parameters[0]["nominal"] in (0, None, math.inf, -math.inf) and finding["effect"] not in ALWAYS_THERE:
+    if not there(finding["effect"], parameters[0]):
         many = len(finding["parameters"]) > 1
         values = ", ".join(no_stop(p["name"], p["value"]) or (f"{p['name']} " if many else "") + estimate(p) for p in parameters)
         sentence = f"{place}: {effect} {values} was left out{ends}"
@@ -87,6 +87,13 @@ def finding_words(finding):
                            for p in parameters)
         sentence = f"{place}: {effect}{':' if values[0].isalpha() else ''} {values}{ends}"
     return sentence + when_words(finding.get("when"))
+
+
+def there(effect, parameter):
+    """Whether the nominal model has some of an effect, so that a parameter of it is wrong rather than left out."""
+    if effect == "joint_stop":
+        return no_stop(parameter["name"], parameter["nominal"]) is None
+    return effect in ALWAYS_THERE or parameter["nominal"] not in (0, None, math.inf, -math.inf)
 
 
 def no_stop(name, value):
@@ -113,7 +120,9 @@ def when_words(when):
     if not when:
         return ""
     if "time" in when:
-        return f", in {when['recording']} from {number(when['time'][0])} to {number(when['time'][1])} s"
+        begin, end = when["time"]
+        decimals = max(0, 2 - math.floor(math.log10(max(end - begin, 1e-6))))  # not so many digits: the clock may count from 1970
+        return f", in {when['recording']} from {begin:.{decimals}f} to {end:.{decimals}f} s"
     return ", where " + " and ".join(f"{state_words(name)} is between {number(a)} and {number(b)}" for name, (a, b) in when.items())
 
 

@@ -53,6 +53,10 @@ class World:
         for actuator in s.actuators:  # what the compiler works out of the mass, it would again of another one
             if actuator.biasprm[2] > 0:
                 actuator.biasprm[2] = m.actuator(actuator.name).biasprm[2]
+            if actuator.inheritrange > 0:  # of the joint, whose range may be what is wrong
+                field = 'actrange' if actuator.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR else 'ctrlrange'
+                setattr(actuator, field, getattr(m.actuator(actuator.name), field).ravel())
+                actuator.inheritrange = 0
         for joint in s.joints:
             if any(joint.springdamper):
                 j = m.joint(joint.name)

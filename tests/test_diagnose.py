@@ -120,7 +120,17 @@ def test_paths_and_recordings_together(tmp_path):
     np.testing.assert_array_equal(same.qpos, made.qpos)
     assert same.name == "held out run.csv" and same.sensors["encoder"].shape == (400, 1)
     both, none = diagnose._recordings([made, tmp_path / "run.csv"], None, model)
-    assert [len(r.time) for r in both] == [400, 400] and none == []
+    assert [(r.name, len(r.time)) for r in both] == [("run.csv", 400), ("run.csv (2)", 400)] and none == []
+
+
+def test_files_may_be_given_in_several_parts(tmp_path, capfd):
+    (tmp_path / "arm.xml").write_text(ARM)
+    (tmp_path / "run.csv").write_bytes(text(run()))
+    good, out = str(tmp_path / "run.csv"), ["--model", str(tmp_path / "arm.xml"), "--out", str(tmp_path / "report")]
+    assert diagnose.main(["--recordings", "first.csv", "--recordings", good, *out]) == 2
+    assert "first.csv: no such file" in capfd.readouterr().err
+    assert diagnose.main(["--recordings", good, "--held-out", "first.csv", "--held-out", "second.csv", *out]) == 2
+    assert "first.csv: no such file" in capfd.readouterr().err
 
 
 def test_one_file_for_two_purposes_is_refused(tmp_path):
@@ -305,6 +315,16 @@ def test_a_stop_on_one_side():
     kept = parameter("low", -1.2, -1.2, 0.0, "rad")
     assert wording.finding_words(finding("joint_stop", "joint", "elbow", kept, gone)) == (
         "joint elbow: joint stop: no stop above instead of 1.20 rad")
+
+
+def test_a_stop_at_zero_is_a_stop():
+    moved, high = parameter("low", 0.0, 0.3, 0.01, "rad"), parameter("high", 2.5, 2.5, 0.0, "rad")
+    words = wording.finding_words(finding("joint_stop", "joint", "knee", moved, high))
+    assert words == "joint knee: joint stop: low 0.300 ± 0.010 rad instead of 0"
+
+
+def test_times_keep_the_digits_that_tell_them_apart():
+    assert wording.when_words({"recording": "run.csv", "time": [1.7e9 + 2.25, 1.7e9 + 7.5]}) == ", in run.csv from 1700000002.25 to 1700000007.50 s"
 
 
 def test_a_match_far_above_the_noise_says_so():

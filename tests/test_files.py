@@ -37,6 +37,23 @@ def test_what_was_there_before_stays(tmp_path, monkeypatch, fails):
     assert os.listdir(tmp_path) == ["a"] and (tmp_path / "a").read_text() == "old"
 
 
+def test_nothing_is_replaced_where_a_folder_is_in_the_way(tmp_path):
+    (tmp_path / "a").write_text("old")
+    (tmp_path / "b").mkdir()
+    with pytest.raises(WriteError, match="cannot write .*b: a folder has that name"):
+        write_together({tmp_path / "a": "new", tmp_path / "b": "new"})
+    assert sorted(os.listdir(tmp_path)) == ["a", "b"] and (tmp_path / "a").read_text() == "old"
+
+
+def test_who_stops_it_leaves_no_parts(tmp_path, monkeypatch):
+    def stopped(*args):
+        raise KeyboardInterrupt
+    monkeypatch.setattr(os, "fsync", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "a", "new")
+    assert os.listdir(tmp_path) == []
+
+
 def test_no_such_folder(tmp_path):
     with pytest.raises(WriteError, match="cannot write .*missing/a: No such file"):
         write_whole(tmp_path / "missing/a", "")

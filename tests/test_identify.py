@@ -1,5 +1,6 @@
 """The statistical method against closed forms, plain loops and stock MuJoCo; then whole diagnoses of a small pendulum."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -131,6 +132,26 @@ def test_windows_that_blow_up_are_counted_beside_the_curve():
     assert [row["seconds"] > 0.405 for row in rows] == ["blown_up" in row for row in rows]
     assert rows[-1]["blown_up"] == {"before": 0, "after": 2, "of": 4}
     assert all(row["after"] == pytest.approx(row["before"], rel=0.5) for row in rows)
+
+
+def test_the_curve_goes_by_time_whatever_the_sampling():
+    """Of recordings of different rates, against a plain loop over windows and their nearest rows."""
+    world, noise = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.5, mass=0.5))), np.array([NOISE])
+    fast, uneven = recorded("fast.csv", 5), np.sort(np.random.default_rng(0).choice(400, 300, replace=False))
+    slower = [replace(r, **{part: getattr(r, part)[rows] for part in ("time", "qpos", "qvel", "ctrl")})
+              for r, rows in ((recorded("slow.csv", 6), slice(None, None, 4)), (recorded("uneven.csv", 7), uneven))]
+    entries = evidence.curve(world, {}, [fast, *slower], noise, np.array([np.inf]))
+    windows = evidence.consecutive([fast, *slower], 0.9)
+    qpos = evidence.predict(world, {}, windows)[0]
+    assert entries[-1]["seconds"] == pytest.approx(0.9, abs=0.05)
+    for entry in entries:
+        square = []
+        for w, path in zip(windows, qpos):
+            time = w.recording.time[w.first:w.last + 1] - w.recording.time[w.first]
+            row = np.argmin(abs(time - entry["seconds"]))
+            if row and abs(time[row] - entry["seconds"]) < 0.021:
+                square.append((path[row, 0] - w.recording.qpos[w.first + row, 0]) ** 2)
+        assert entry["before"] == pytest.approx(np.sqrt(np.mean(square)) / NOISE, rel=0.1) and entry["floor"] > 0
 
 
 def test_floor_is_what_noise_does_to_a_perfect_simulator():

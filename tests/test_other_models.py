@@ -259,6 +259,42 @@ def test_a_muscles_joint_is_not_given_another_zero():
     assert corrected(world, "sensor_bias", "j", 0.05)[1] == "mjcf"
 
 
+@pytest.mark.parametrize("actuator, field", [('position name="m" kp="20" inheritrange="0.9"', "ctrlrange"),
+                                             ('intvelocity name="m" kp="20" inheritrange="0.9"', "actrange")])
+def test_a_range_that_was_inherited_stays_as_it_was(actuator, field):
+    world = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator=actuator).replace('name="k"', 'name="k" range="-60 60"')))
+    for effect, values in (("joint_stop", (-0.3, 0.5)), ("sensor_bias", (0.1,))):
+        model, form = corrected(world, effect, "k", *values)
+        nominal = getattr(world.model, f"actuator_{field}")
+        assert form == "mjcf" and nominal[0, 1] == pytest.approx(0.9 * np.deg2rad(60))
+        np.testing.assert_allclose(getattr(model, f"actuator_{field}"), nominal)
+
+
+def test_another_zero_of_a_joint_without_limits():
+    xml = TWO.format(joint="", actuator=TWO_AXES).replace("<option", '<compiler autolimits="false"/><option')
+    world = World(mujoco.MjSpec.from_string(xml))
+    assert corrected(world, "sensor_bias", "j", 0.1)[1] == "mjcf"
+    both = {world.candidate("joint_stop", "j"): (-0.5, 0.5), world.candidate("sensor_bias", "j"): (0.1,)}
+    model = mujoco.MjModel.from_xml_string(world.corrected_xml(both)[0])
+    np.testing.assert_allclose(model.joint("j").range, [-0.4, 0.6])
+
+
+def test_a_corrected_model_may_lack_another_force():
+    world, xml = World(mujoco.MjSpec.from_string(TWO.format(joint="", actuator=TWO_AXES))), None
+    for names in ({"unknown:j"}, {"unknown:j", "unknown:j:2"}):
+        curve = world.curve("j", "velocity:j", np.array([-1.0, 0.0, 1.0]))
+        xml, written = world.corrected_xml({curve: (0.3, 0.1, -0.1)})
+        world = World(mujoco.MjSpec.from_string(xml))
+        assert list(written.values()) == ["mjcf"] and names <= {a.name for a in world.spec.actuators}
+
+
+@pytest.mark.parametrize("joint, transmission, unit", [("hinge", "joint", "N·m"), ("hinge", "jointinparent", "N·m"), ("ball", "joint", "N·m"), ("slide", "joint", "N")])
+def test_the_unit_of_a_motors_force(joint, transmission, unit):
+    world = World(mujoco.MjSpec.from_string(f'''<mujoco><worldbody><body><joint name="j" type="{joint}"/><geom size=".1"/></body></worldbody>
+      <actuator><motor name="m" {transmission}="j" ctrlrange="-1 1"/></actuator></mujoco>'''))
+    assert world.candidate("saturation", "m").parameters[0].unit == unit
+
+
 # ---- holes and constants -----------------------------------------------------------------------
 
 

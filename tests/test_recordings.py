@@ -4,6 +4,7 @@ import os
 import sys
 import time
 import types
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -140,6 +141,14 @@ def test_minari_episodes(model, monkeypatch):
     assert (load("arm/random-v0", model)[1].qpos == 1).all()
     with pytest.raises(RecordingError, match="arm/expert-v0.*not a readable Minari dataset"):
         load("arm/expert-v0", model)
+    dataset = Minari(None)
+    dataset.episodes[1].actions = {"arm": np.zeros((10, 2))}
+    monkeypatch.setitem(sys.modules, "minari", dataset)
+    with pytest.raises(RecordingError, match="arm/random-v0: not a readable Minari dataset"):
+        load("arm/random-v0", model)
+    dataset.episodes.clear()
+    with pytest.raises(RecordingError, match="arm/random-v0: the dataset holds no episodes"):
+        load("arm/random-v0", model)
 
 
 def test_files_of_one_name_are_told_apart(tmp_path, model, good):
@@ -147,6 +156,39 @@ def test_files_of_one_name_are_told_apart(tmp_path, model, good):
         (tmp_path / folder).mkdir()
         put(tmp_path / folder, text(good))
     assert [r.name for r in load([tmp_path / "a/run.csv", tmp_path / "b/run.csv"], model)] == ["a/run.csv", "b/run.csv"]
+
+
+def test_as_many_folders_as_it_takes_tell_files_apart(tmp_path, model, good):
+    paths = [tmp_path / day / "run" / "data.csv" for day in ("day1", "day2")]
+    for path in paths:
+        path.parent.mkdir(parents=True)
+        path.write_bytes(text(good))
+    link = tmp_path / "run3.csv"
+    link.symlink_to(put(tmp_path, text(good), "stored.csv"))
+    assert [r.name for r in load([*paths, link], model)] == ["day1/run/data.csv", "day2/run/data.csv", "run3.csv"]
+
+
+@pytest.mark.parametrize("hertz, rate", [(7, 50), (13, 100), (2.5, 20)])
+def test_fast_motion_in_few_rows_is_motion(hertz, rate):
+    slow = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>')
+    time, noise = np.arange(10 * rate) / rate, 1e-4 * np.random.default_rng(0).normal(size=(10 * rate, 1))
+    still = Recording("run.csv", time, noise, np.full((len(time), 1), np.nan), np.zeros((len(time), 0)))
+    with pytest.raises(RecordingError, match="nothing moves beyond the sensors' noise"):
+        check([still], slow)
+    assert check([replace(still, qpos=noise + 0.3 * np.sin(2 * np.pi * hertz * time)[:, None])], slow) == []
+
+
+def test_who_turns_on_while_not_measured_is_not_wrapped():
+    wheel = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>')
+    time = 0.01 * np.arange(500)
+    qpos = (10 * time + 0.3 * np.sin(3 * time))[:, None]
+    qpos[200:262] = np.nan
+    turning = Recording("run.csv", time, qpos, np.full((500, 1), np.nan), np.zeros((500, 0)))
+    [note] = check([turning], wheel)
+    assert "nan in 12 % of its rows" in note
+    wrapped = (qpos + np.pi) % (2 * np.pi) - np.pi
+    with pytest.raises(RecordingError, match="a wrapped angle"):
+        check([replace(turning, qpos=wrapped)], wheel)
 
 
 def test_a_name_of_any_bytes(tmp_path, model, good):

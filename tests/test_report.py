@@ -32,6 +32,7 @@ from recordings import Recording
 from tests.malformed import ARM, arm, run
 from world import World
 
+EPOCH = 1.7e9  # s, of a clock that counts from 1970
 BROWSER = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome")) if path), None)
 
 
@@ -184,6 +185,7 @@ def test_only_own_curves_are_removed(diagnosis, tmp_path):
     ("position:elbow", None, False, (-1.0, -0.2, 0.9), "position:elbow,force"),
     ("position:elbow", "velocity:shoulder", False, (-1.0, -0.2, 0.9), "position:elbow,sign(velocity:shoulder),force"),
     ("time", "control:elbow_motor", False, (0.0, 1.0, 3.0), "time,control:elbow_motor,force"),
+    ("time", "control:elbow_motor", False, (EPOCH, EPOCH + 1.0, EPOCH + 3.0), "time,control:elbow_motor,force"),
     ("time", None, True, (0.0, 0.2), "time,force")])
 def test_a_saved_curve_is_the_force_that_is_simulated(diagnosis, tmp_path, variable, factor, wave, knots, header):
     """The force that the engine applies in the shoulder, at random states, from the rows of the file alone."""
@@ -196,7 +198,7 @@ def test_a_saved_curve_is_the_force_that_is_simulated(diagnosis, tmp_path, varia
     rows = np.loadtxt(tmp_path / "unknown_1.csv", delimiter=",", skiprows=1)
     force = candidate.effect.force([model], 0, values[None])
     for _ in range(50):
-        (q, v, u), t = rng.uniform(-0.9, 0.9, (3, 1, 2)), rng.uniform(0, 2.9)
+        (q, v, u), t = rng.uniform(-0.9, 0.9, (3, 1, 2)), max(knots[0], 0.0) + rng.uniform(0, 2.9)
         x, times = (t if variable == "time" else q[0, 1]), {"": 1.0, "v": np.sign(v[0, 0]), "c": u[0, 1]}[(factor or "")[:1]]
         some = rows[rows[:, 1] == 1] if factor else rows
         expected = force(q, v, u, np.array([t]))[0, 0]
@@ -259,6 +261,13 @@ def test_ticks_are_round_and_inside(low, high):
     found = figures.ticks(low, high)
     assert 3 <= len(found) <= 11 and all(low - 1e-9 * abs(low) <= t <= high + 1e-9 * abs(high) for t in found)
     assert len({round(b - a, 12) for a, b in zip(found, found[1:])}) == 1 or low == 1e-6
+
+
+def test_times_since_1970_can_be_read_from_an_axis():
+    time = EPOCH + np.linspace(0.5, 8, 50)
+    chart = figures.chart([figures.Series(time, np.sin(time), "measured")], "time (s)", "force")
+    assert "time (s), from 1700000000 on" in chart and re.findall(r'text-anchor="middle">([\d.]+)<', chart) == ["2", "4", "6", "8"]
+    assert "from" not in figures.chart([figures.Series(time - EPOCH, np.sin(time), "measured")], "time (s)", "force")
 
 
 def test_thinned_curves_keep_extremes_and_gaps():
