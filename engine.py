@@ -87,8 +87,6 @@ class Engine:
         n = len(cases)
         qpos, qvel = np.tile(self.model.qpos0, (n, 1)), np.zeros((n, self.model.nv))
         recordings = [w.recording for w in windows]
-        if not all(hasattr(r, 'qpos') for r in recordings):
-            return qpos, qvel
         marks = [begin - back for back in np.arange(RUN_UP[0], 0.0, -RUN_UP[1])] + [begin]
         marks = [np.maximum(t, [r.time[0] for r in recordings]) for t in marks]
         for now, then in zip(marks[:-1], marks[1:]):
@@ -264,5 +262,5 @@ def recorded_state(model, recording, t):
     if b > a:
         seconds = recording.time[b] - recording.time[a]
         mujoco.mj_differentiatePos(model, qvel, seconds, recording.qpos[a], recording.qpos[b])
-    measured = getattr(recording, 'qvel', None)
-    return recording.qpos[row], qvel if measured is None else np.where(np.isfinite(measured[row]), measured[row], qvel)
+    measured = recording.qvel[row]
+    return recording.qpos[row], np.where(np.isfinite(measured), measured, qvel)

@@ -1,7 +1,5 @@
 """Mechanisms, recordings and the plain loop that the tests of effects and simulator share."""
 
-from types import SimpleNamespace
-
 import mujoco
 import numpy as np
 
@@ -55,11 +53,17 @@ def arm(kind):
     return World(mujoco.MjSpec.from_string(xml)), xml
 
 
+def commanded(time, ctrl=None, joints=1, name='made-up'):
+    """A Recording of controls (T, nu), or of none, without measurements: what a simulation needs of one."""
+    unread = np.full((len(time), joints), np.nan)
+    return Recording(name, time, unread, unread, np.empty((len(time), 0)) if ctrl is None else ctrl)
+
+
 def record(world, seed=0, rows=T, dt=DT):
     """A made-up recording: random held controls, made strong enough to move and touch the floor."""
     rng = np.random.default_rng(seed)
     ctrl = np.repeat(rng.uniform(-1, 1, (rows // 4 + 1, world.model.nu)), 4, axis=0)[:rows] * [1.0, 2.0, 3.0][:world.model.nu]
-    return SimpleNamespace(name='made-up', time=np.arange(rows) * dt, ctrl=ctrl)
+    return commanded(np.arange(rows) * dt, ctrl, world.model.njnt)
 
 
 def stock(xml, world, recording, qpos, qvel, rows=T):

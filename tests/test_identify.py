@@ -22,7 +22,7 @@ import unknown
 import windows as cut
 from effects import Candidate, Parameter
 from identify import identify, named_instead
-from plants import DROP, dropped
+from plants import DROP, commanded, dropped
 from recordings import Recording
 from world import World
 
@@ -336,7 +336,7 @@ def test_what_stands_in_a_curves_place_brings_its_equals_along():
 
 
 def test_scatter_of_errors_between_recordings_is_students():
-    rng, runs = np.random.default_rng(1), [SimpleNamespace(time=np.arange(9.0)) for _ in range(14)]
+    rng, runs = np.random.default_rng(1), [commanded(np.arange(9.0)) for _ in range(14)]
     windows, known = [cut.Window(r, 0, 8) for r in runs], np.full((14, 8, 1), True)
     one, other = rng.normal(0, 2, (2, 14, 8, 1))
     rise, bound, _ = earning.scatter(windows, (one, known), (other, known))
@@ -348,7 +348,7 @@ def test_scatter_of_errors_between_recordings_is_students():
 
 
 def test_what_an_effect_adds_is_believed_where_the_measurements_may_hold_all_of_it():
-    rng, runs = np.random.default_rng(0), [SimpleNamespace(time=np.arange(9.0)) for _ in range(30)]
+    rng, runs = np.random.default_rng(0), [commanded(np.arange(9.0)) for _ in range(30)]
     windows, known = [cut.Window(r, 0, 8) for r in runs], np.full((30, 8, 1), True)
     believed = {0.0: 0, 1.0: 0}
     for share in believed:

@@ -1,5 +1,6 @@
 """Effects: what a batch simulates is what stock MuJoCo makes of corrected.xml, and nothing at zero size."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from plants import MODELS, SIZES, START, T, arm, pendulum, record, simulate, stock
+from plants import MODELS, SIZES, START, T, arm, commanded, pendulum, record, simulate, stock
 
 from curves import asked
 from physics import EFFECTS
@@ -82,7 +83,7 @@ def test_stribeck_friction_in_mjcf_and_by_hand():
     """Bristles, frictionloss with a force, and the law itself at a fine step agree through reversals and sticking."""
     world, (coulomb, static, velocity) = pendulum(), (0.1, 0.2, 0.3)
     time = np.arange(100) * 0.01
-    recording = SimpleNamespace(name='', time=time, ctrl=(0.5 * np.sin(6 * time) + 0.3 * np.sin(14 * time + 1))[:, None])
+    recording = commanded(time, (0.5 * np.sin(6 * time) + 0.3 * np.sin(14 * time + 1))[:, None])
     setting = {world.candidate('stribeck_friction', 'j'): (coulomb, static, velocity)}
     qpos, _ = world.simulate([setting, {}], [[0.0]] * 2, [[1.0]] * 2, [Window(recording, 0, 99)] * 2)
     corrected, _ = world.corrected_xml(setting)
@@ -116,7 +117,7 @@ def test_stribeck_friction_that_does_not_fall_is_coulomb_friction():
 def test_coulomb_friction_holds():
     """Below its limit the joint stands still: no creep, unlike MuJoCo's default friction."""
     world = pendulum()
-    recording = SimpleNamespace(name='', time=np.array([0.0, 1.0]), ctrl=np.full((2, 1), 0.09))
+    recording = commanded(np.array([0.0, 1.0]), np.full((2, 1), 0.09))
     setting = {world.candidate('coulomb_friction', 'j'): (0.12,)}
     qpos, _ = world.simulate([setting], [[0.0]], [[0.0]], [Window(recording, 0, 1)])
     assert abs(qpos[0, 1, 0]) < 2e-4
@@ -126,7 +127,7 @@ def test_unknown_curves():
     """A curve through damping's values is damping, in simulation and in MJCF; a wiggle has no MJCF form."""
     world = pendulum()
     time = np.arange(60) * 0.01
-    recording = SimpleNamespace(name='', time=time, ctrl=0.5 * np.sin(9 * time)[:, None])
+    recording = commanded(time, 0.5 * np.sin(9 * time)[:, None])
     knots = np.linspace(-6, 6, 25)
     curve, damping = world.curve('j', 'velocity:j', knots), world.candidate('viscous_damping', 'j')
     spring = world.curve('j', 'position:j', np.linspace(-1, 2, 61))
@@ -162,7 +163,7 @@ def test_what_actuators_are_asked_is_their_force_over_their_gain():
 def test_probes_show_something(case):
     """Values to try first lie within the bounds and change the motion."""
     world, _, recording = case
-    recording.qpos = simulate(world, [{}], recording)[0]
+    recording = replace(recording, qpos=simulate(world, [{}], recording)[0])
     for candidate in world.candidates:
         rows = np.array([*world.probes(candidate, [recording]), *world.far(candidate, [recording])])
         suited = world.suited(candidate, [recording]).parameters
@@ -174,8 +175,7 @@ def test_probes_show_something(case):
 
 def test_stribeck_friction_has_fallen_at_the_speeds_that_are_reached():
     world, _ = arm('motors')
-    run = record(world)
-    run.qpos = np.cumsum(np.random.default_rng(0).uniform(0, 0.02, (T, world.model.nq)), 0)  # at up to 2 rad/s
+    run = replace(record(world), qpos=np.cumsum(np.random.default_rng(0).uniform(0, 0.02, (T, world.model.nq)), 0))  # at up to 2 rad/s
     candidate = world.candidate('stribeck_friction', 'elbow')
     velocity = world.suited(candidate, [run]).parameters[2]
     assert 0.5 < velocity.high < 1.5 and velocity.low < velocity.nominal <= velocity.high

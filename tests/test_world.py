@@ -1,13 +1,11 @@
 """The batched simulator against closed forms, plain loops and itself, one simulation at a time."""
 
-from types import SimpleNamespace
-
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from plants import ARM, DT, MODELS, SIZES, START, T, arm, pendulum, record, simulate
+from plants import ARM, DT, MODELS, SIZES, START, T, arm, commanded, pendulum, record, simulate
 
 from signals import Signal
 from world import Window, World
@@ -74,7 +72,7 @@ def test_muscles_go_on_too():
     world = World(mujoco.MjSpec.from_string("""<mujoco><option timestep="0.002"/><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
         <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02"/></body></worldbody><actuator><muscle name="m" joint="j" force="50"
         lengthrange="-1 1" ctrlrange="0 1"/></actuator></mujoco>"""))
-    recording = SimpleNamespace(name='', time=0.01 * np.arange(40), ctrl=np.repeat([[0.1], [1.4], [0.0], [0.6]], 10, axis=0))
+    recording = commanded(0.01 * np.arange(40), np.repeat([[0.1], [1.4], [0.0], [0.6]], 10, axis=0))
     data, states = mujoco.MjData(world.model), []
     data.act[0] = recording.ctrl[0, 0]
     for control in recording.ctrl:
@@ -95,7 +93,7 @@ BALLS = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbod
 def test_effects_of_a_ball_joint(effect, value, attribute):
     """The same as the attribute in the file, and as the corrected file; the same in all directions."""
     world = World(mujoco.MjSpec.from_string(BALLS.format('')))
-    recording = SimpleNamespace(name='', time=0.01 * np.arange(40), ctrl=np.zeros((40, 0)))
+    recording = commanded(0.01 * np.arange(40))
     start = np.array([[0.9, 0.3, -0.3, np.sqrt(1 - 0.81 - 0.18)]]), np.array([[1.0, -2.0, 3.0]])
     setting = {world.candidate(effect, 'neck'): (value,)}
     predicted = world.simulate([setting], *start, [Window(recording, 0, 39)])[0][0]
@@ -122,7 +120,7 @@ def test_rows_between_time_steps():
         c, s, rest = np.cos(w * dt), np.sin(w * dt), f / 50
         q, v = rest + (q - rest) * c + v / w * s, -(q - rest) * w * s + v * c
         exact.append((q, v))
-    recording = SimpleNamespace(name='', time=time, ctrl=force[:, None])
+    recording = commanded(time, force[:, None])
     qpos, qvel = world.simulate([{}] * 2, [[0.1]] * 2, [[-0.3]] * 2, [Window(recording, 0, 59), Window(recording, 0, 20)])
     np.testing.assert_allclose(qpos[0, :, 0], np.array(exact)[:, 0], atol=2e-5)
     np.testing.assert_allclose(qvel[0, :, 0], np.array(exact)[:, 1], atol=4e-3)
@@ -142,7 +140,7 @@ def test_sensors_of_the_joints(case):
     world, _, recording = case
     setting = {world.candidate('sensor_bias', 'elbow'): (0.1,), world.candidate('sensor_scale', 'elbow'): (1.2,)}
     time = np.arange(601) * 0.001
-    dense = SimpleNamespace(name='', time=time, ctrl=recording.ctrl[np.minimum((time + 1e-9) // DT, T - 1).astype(int)])
+    dense = commanded(time, recording.ctrl[np.minimum((time + 1e-9) // DT, T - 1).astype(int)])
     true = [x.copy() for x in START]
     true[0][2], true[1][2] = (START[0][2] - 0.1) / 1.2, START[1][2] / 1.2
     run = world.simulate([{}], *(x[None] for x in true), [Window(dense, 0, 590)])[0][0]
@@ -177,7 +175,7 @@ def test_effects_under_a_condition():
     """A load in the middle of the run, friction in part of the range: against a loop that switches them."""
     world = pendulum()
     time = np.arange(80) * 0.01
-    recording = SimpleNamespace(name='run', time=time, ctrl=0.3 * np.sin(9 * time)[:, None])
+    recording = commanded(time, 0.3 * np.sin(9 * time)[:, None], name='run')
     window, model = Window(recording, 5, 75), world.model
     body = model.body(1).name
 
@@ -222,7 +220,7 @@ def test_effects_under_a_condition():
 
 def test_unstable_simulations_are_nan_and_silent(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    world, recording = pendulum('Euler'), SimpleNamespace(name='', time=np.arange(50) * 0.01, ctrl=np.ones((50, 1)))
+    world, recording = pendulum('Euler'), commanded(np.arange(50) * 0.01, np.ones((50, 1)))
     wild = {world.candidate('nonlinear_stiffness', 'j'): (-1e9,)}
     no_inertia = {world.candidate('inertia', '1'): (1e-20, 1e-20, 1e-20), world.candidate('mass', '1'): (1e-20,)}
     settings_ = [{}, wild, {}, no_inertia, {world.curve('j', 'position:j', (-1.0, 1.0)): (-1e12, 1e12)}]
@@ -255,7 +253,7 @@ def test_a_block_that_only_slides_and_hops():
              </body></worldbody><actuator><motor joint="x"/><motor joint="z"/></actuator></mujoco>"""
     world = World(mujoco.MjSpec.from_string(xml))
     rng = np.random.default_rng(0)
-    recording = SimpleNamespace(name='', time=np.arange(60) * 0.01, ctrl=rng.uniform(-20, 10, (60, 2)))
+    recording = commanded(np.arange(60) * 0.01, rng.uniform(-20, 10, (60, 2)))
     data, run = mujoco.MjData(world.model), []
     data.qvel[:] = 0.3, 0.8
     for t in range(60):
@@ -274,7 +272,7 @@ CUBE = """
 def test_a_tossed_cube(case):
     """Free joints and contacts: the same in MJCF; friction follows the larger of the two geoms' nominally."""
     world = World(mujoco.MjSpec.from_string(CUBE))
-    recording = SimpleNamespace(name='', time=np.arange(60) / 148, ctrl=np.zeros((60, 0)))
+    recording = commanded(np.arange(60) / 148)
     q, v = np.array([0, 0, 0.12, 1, 0, 0, 0.0]), np.array([1.0, 0.3, -1, 2, 1, 0])
     settings_ = [{}] + [{world.candidate(e, g): x} for g in ('floor', 'box') for e, x in (('contact_friction', (0.18,)), ('contact_stiffness', (9000.0,)))]
     qpos, _ = world.simulate(settings_, np.tile(q, (5, 1)), np.tile(v, (5, 1)), [Window(recording, 0, 59)] * 5)
