@@ -74,6 +74,7 @@ def set_lag(actuator, seconds, model):
 class Gain(ActuatorEffect):
     """The actuator is stronger or weaker by a ratio, feedback of a servo included."""
     name, simplicity, related = 'gain', 0, ('mass', 'armature', 'viscous_damping', 'stiffness')
+    acts_through = 'control'
 
     def parameters(self, model, i):
         return Parameter('gain', '1', 1.0, 0.01, 100.0, 0.01),
@@ -110,6 +111,7 @@ class Bias(ActuatorEffect):
 class BackEmf(ActuatorEffect):
     """A force −d·(actuator velocity): back-EMF, or the velocity gain of a servo."""
     name, related = 'back_emf', ('viscous_damping', 'gain', 'lag')
+    acts_through = 'velocity'
 
     def parameters(self, model, i):
         nominal, step = -model.actuator_biasprm[i, 2], 0.01 * self.strength(model, i)
@@ -130,6 +132,7 @@ class BackEmf(ActuatorEffect):
 class Saturation(ActuatorEffect):
     """The force is cut off at ± forcerange (of a range that is not symmetric: its larger end)."""
     name, related = 'saturation', ('gain',)
+    acts_through = 'control'
 
     def parameters(self, model, i):
         F = self.strength(model, i)
@@ -160,6 +163,7 @@ class Saturation(ActuatorEffect):
 class Lag(ActuatorEffect):
     """The command passes a first-order filter."""
     name, related = 'lag', ('delay', 'back_emf', 'time_step')
+    acts_through = 'control'
 
     def fits(self, model, i):
         return super().fits(model, i) and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
@@ -181,6 +185,7 @@ class Lag(ActuatorEffect):
 class Delay(ActuatorEffect):
     """The command acts later, by any fraction of a time step."""
     name, simplicity, related = 'delay', 0, ('lag', 'sensor_delay', 'time_step')
+    acts_through = 'control'
 
     def parameters(self, model, i):
         return Parameter('seconds', 's', nominal_delay(model, i), 0.0, 1.0, 0.001),
@@ -216,6 +221,7 @@ def nominal_delay(model, i):
 class DeadZone(ActuatorEffect):
     """Nothing happens below a threshold: of the control (motor) or of the force (servo)."""
     name, simplicity, amplitudes, related = 'dead_zone', 2, 1, ('coulomb_friction', 'gain')
+    acts_through = 'control'
 
     def fits(self, model, i):
         motor = model.actuator_gainprm[i, 0] and not self._servo(model, i)

@@ -18,7 +18,6 @@ import numpy as np
 from hidden import Real
 from mechanisms import MECHANISMS, UNKNOWNS
 
-DEVELOPMENT_SEEDS = range(1, 1000)                   # for looking at, and improving the method on
 FINAL_SEED = 314159             # of the table to publish next: run once, while the method stands still
 SIZES = (0.03, 0.1, 0.3)
 NOISES = (0.0003, 0.001)                             # rad or m per reading
@@ -80,7 +79,10 @@ def conceal(seed, number, folder):
         raise RuntimeError(f"trial {number} of seed {seed}: no sane experiment in 20 attempts")
     mechanism = MECHANISMS[answer["mechanism"]]
     for name, run in runs.items():
-        (_write_npz if mechanism.env else _write_csv)(folder / name, run, mechanism.spec().compile())
+        if mechanism.env:
+            _write_npz(folder / name, run)
+        else:
+            _write_csv(folder / name, run, mechanism.spec().compile())
     command = ["--recordings", *sorted(n for n in runs if n.startswith("train")),
                "--held-out", *sorted(n for n in runs if n.startswith("held_out"))]
     if mechanism.env:
@@ -170,7 +172,7 @@ def _item(effect, name, size, model, scale, rng):
     if effect in NAMED:
         return _place("mass", "body", name, mass=float(model.body(name).mass[0] * NAMED[effect][2]))
     if effect in ("gravity", "wind", "air_drag", "time_step"):
-        return _world(effect, size, sign, model, rng)
+        return _world(effect, size, model, rng)
     if effect.startswith(("contact", "ground")):
         geom = model.geom(name).id
         stiffness, damping = -model.geom_solref[geom]
@@ -180,7 +182,7 @@ def _item(effect, name, size, model, scale, rng):
                  "ground_height": ("z", model.geom_pos[geom, 2] + sign * size * 0.1)}[effect]
         return _place(effect, "geom", name, **{value[0]: float(value[1])})
     if effect in ("mass", "center_of_mass", "inertia", "external_force", "payload_change", "link_length"):
-        return _body(effect, name, size, sign, model, scale, rng)
+        return _body(effect, name, size, sign, model, rng)
     if effect in ("gain", "bias", "delay", "lag", "saturation", "back_emf", "dead_zone"):
         return _actuator(effect, name, size, sign, model, scale)
     joint = model.joint(name)
@@ -243,7 +245,7 @@ def _place(effect, kind, name, **parameters):
     return {"effect": effect, "place": {"kind": kind, "name": name}, "parameters": parameters}
 
 
-def _world(effect, size, sign, model, rng):
+def _world(effect, size, model, rng):
     flat = not any(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) and not np.abs(
         model.jnt_axis[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE][:, [0, 2]]).any()
     turn = np.pi * rng.integers(2) if flat else rng.uniform(0, 2 * np.pi)     # flat: moves in x and z only
@@ -259,7 +261,7 @@ def _world(effect, size, sign, model, rng):
     return _place(effect, "world", "world", seconds=float(model.opt.timestep / 4))
 
 
-def _body(effect, name, size, sign, model, scale, rng):
+def _body(effect, name, size, sign, model, rng):
     body = model.body(name)
     mass, inertia = float(body.mass[0]), np.array(body.inertia)
     length = float(np.linalg.norm(body.ipos)) or float(max(model.geom_rbound[body.geomadr[0]], 0.05))
@@ -368,7 +370,7 @@ def _write_csv(path, run, model):
     path.write_text("\n".join([",".join(header), *rows]) + "\n")
 
 
-def _write_npz(path, run, model):
+def _write_npz(path, run):
     arrays = {"time": run.time, "qpos": run.qpos, "ctrl": run.ctrl}
     if np.isfinite(run.qvel).any():
         arrays["qvel"] = run.qvel

@@ -7,7 +7,8 @@
     diagnosis.summary["findings"]
 
 Writes report.html (to look at), diagnosis.json (to compute with) and corrected.xml (to simulate with). Exit status: 0 a
-diagnosis was made, whatever it says; 2 bad input or not enough data, 1 a fault of this program, with one line on stderr.
+diagnosis was made, whatever it says; 2 bad input or not enough data, 1 a fault of this program, 130 stopped by Ctrl-C, with one
+line on stderr.
 """
 import argparse
 import dataclasses
@@ -16,7 +17,6 @@ import os
 import sys
 import traceback
 
-import gymnasium
 import mujoco
 import numpy as np
 from tqdm import tqdm
@@ -72,9 +72,9 @@ def split(recordings):
                 f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} rows; record again, longer "
                 f"({recorded.ENOUGH}), or give --held-out")
         early = dataclasses.replace(
-            recording, time=recording.time[:cut], qpos=recording.qpos[:cut], qvel=recording.qvel[:cut],
+            recording, start=0, time=recording.time[:cut], qpos=recording.qpos[:cut], qvel=recording.qvel[:cut],
             ctrl=recording.ctrl[:cut], sensors={name: values[:cut] for name, values in recording.sensors.items()})
-        parts += [early, dataclasses.replace(recording, start=cut)]
+        parts += [early, dataclasses.replace(recording, start=max(cut, recording.start))]
     return parts[::2], parts[1::2]
 
 
@@ -82,7 +82,7 @@ def _world(model):
     """The nominal simulator of an MJCF path, a gymnasium id, or an MjSpec."""
     if isinstance(model, mujoco.MjSpec):
         what, make = "the given MjSpec", World
-    elif os.path.exists(model := os.fspath(model)) or model.endswith(".xml"):
+    elif os.path.isfile(model := os.fspath(model)) or model.endswith(".xml"):
         what, make = model, World.load
         if not os.path.isfile(model):
             raise ModelError(f"{model}: no such model file; check the path")
@@ -90,7 +90,7 @@ def _world(model):
         what, make = model, World.from_env
     try:
         world = make(model)
-    except (ValueError, OSError, TypeError, AttributeError, ImportError, mujoco.FatalError, gymnasium.error.Error) as error:
+    except (ValueError, OSError, TypeError, AttributeError, ImportError, mujoco.FatalError) as error:
         do = "correct the file" if make is World.load else "give the id of a gymnasium MuJoCo environment, or --model file.xml"
         raise ModelError(f"{what}: the model does not load ({error}); {do}") from None
     if world.model.nq == 0:
@@ -164,7 +164,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(argv=None):
-    """The command. Returns the exit status: 0, or 2 or 1 with one line on stderr."""
+    """The command. Returns the exit status: 0, or 2 (its input), 1 (a fault of this program) or 130 (Ctrl-C) with one line on stderr."""
     parser = _Parser(prog="diagnose.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     nominal = parser.add_mutually_exclusive_group(required=True)
     nominal.add_argument("--model", help="MJCF file of the nominal simulator")
@@ -192,7 +192,7 @@ def main(argv=None):
     except (recorded.RecordingError, ModelError, report.ReportError, mujoco.FatalError, MemoryError) as error:
         if bar:
             bar.close()
-        message = str(error) or "out of memory; give fewer or shorter recordings"
+        message = " ".join(str(error).split()) or "out of memory; give fewer or shorter recordings"
         print(f"diagnose.py: {message}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -208,7 +208,8 @@ def main(argv=None):
         return 1
     if bar:
         bar.close()
-    sys.stdout.reconfigure(errors="replace")  # a terminal that cannot show ± or ∞ still shows the rest
+    if hasattr(sys.stdout, "reconfigure"):  # a terminal that cannot show ± or ∞ still shows the rest
+        sys.stdout.reconfigure(errors="replace")
     print(wording.terminal(diagnosis.summary, args.out.rstrip("/"), files))
     return 0
 

@@ -113,7 +113,7 @@ def marked(model, place):
         if geom is None:
             return [], None
         if model.geom_type[geom] == GEOM.mjGEOM_PLANE:
-            return [geom], lambda data: _under(model, data, geom)
+            return [geom], lambda data: _under(data, geom)
         return [geom], lambda data: data.geom_xpos[geom]
     elif kind == "body":
         body = _id(model.body, name)
@@ -187,14 +187,14 @@ def mechanism(model, poses, places, labels, width=380, height=300):
         points.append(None if where is None else paper(where(data) @ axes.T))
     parts = [f'<svg viewBox="0 0 {width} {height}" role="img" class="mechanism" aria-label="drawing of the mechanism'
              f'{"; marked: " + html.escape(", ".join(labels), quote=True) if labels else ""}">']
-    parts += _ground(model, data, axes, towards, paper, width, height, coloured)
+    parts += _ground(model, data, axes, towards, paper, width, coloured)
     for ghost in ghosts:
         parts += [f'<path class="part ghost" d="{_path(paper(points_))}"/>' for _, points_, _ in ghost]
     parts += _links(model, data, axes, paper)
     for g, outline, _ in drawn[0]:
         parts.append(f'<path class="part{" bad" if g in coloured else ""}" d="{_path(paper(outline))}"/>')
     for j in range(model.njnt):
-        parts.append(_joint(model, data, j, axes, towards, paper))
+        parts.append(_joint(model, data, j, axes, paper))
     used = []
     for label, point in zip(labels, points):
         if point is not None:
@@ -216,7 +216,7 @@ def mechanism(model, poses, places, labels, width=380, height=300):
     return "".join(parts) + "</svg>"
 
 
-def _ground(model, data, axes, towards, paper, width, height, coloured):
+def _ground(model, data, axes, towards, paper, width, coloured):
     """Planes: a line where seen edge-on, else a sheet."""
     parts = []
     for g in np.flatnonzero(model.geom_type == int(GEOM.mjGEOM_PLANE)):
@@ -227,13 +227,13 @@ def _ground(model, data, axes, towards, paper, width, height, coloured):
             a, b = paper(axes @ centre - 1e3 / paper.scale * along), paper(axes @ centre + 1e3 / paper.scale * along)
             parts.append(f'<path class="ground{bad}" d="M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}"/>')
         elif abs(frame[:, 2] @ towards) < 0.95:  # face-on it would only be a background
-            reach, middle = 0.4 * width / paper.scale, _under(model, data, g)
+            reach, middle = 0.4 * width / paper.scale, _under(data, g)
             corners = [middle + reach * (x * frame[:, 0] + y * frame[:, 1]) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
             parts.append(f'<path class="sheet{bad}" d="{_path(paper(np.array(corners) @ axes.T))}"/>')
     return parts
 
 
-def _under(model, data, plane):
+def _under(data, plane):
     """(3,) the point of a plane beneath the mechanism: its own centre can be far away."""
     normal, middle = data.geom_xmat[plane].reshape(3, 3)[:, 2], data.xipos[1:].mean(axis=0)
     return middle - ((middle - data.geom_xpos[plane]) @ normal) * normal
@@ -255,7 +255,7 @@ def _links(model, data, axes, paper):
     return parts
 
 
-def _joint(model, data, j, axes, towards, paper):
+def _joint(model, data, j, axes, paper):
     """A hinge as a small ring, a slide as a double arrow along its axis."""
     x, y = paper(axes @ data.xanchor[j])
     kind = JOINT(model.jnt_type[j])
@@ -291,7 +291,7 @@ def animation(model, motions, seconds, width=380, height=300):
     paths = {look: ["".join("M" + "L".join(f"{x:.0f} {y:.0f}" for x, y in paper(outline)) + "Z" for _, outline, _ in frame)
                     for frame in motion] for look, motion in drawn.items()}
     data = _posed(model, frames["measured"][0])
-    ground = "".join(_ground(model, data, axes, towards, paper, width, height, set()))
+    ground = "".join(_ground(model, data, axes, towards, paper, width, set()))
     layers = "".join(f'<path class="{look} layer" d="{motion[0]}"/>' for look, motion in paths.items())
     return (f'<figure class="animation" data-seconds="{seconds:.3f}"><svg viewBox="0 0 {width} {height}" role="img" '
             f'aria-label="recorded, nominal and corrected motion over each other">{ground}{layers}</svg>'

@@ -10,7 +10,7 @@ unless a class overrides it:
     suited    steps for the motion recorded        far      values to try at full size
 
 Values are absolute, in SI units, with the sign of the MJCF field. A new effect
-is one class with the decorator @catalogue and no other line.
+is one class with the decorator @catalogue, and no other line.
 """
 
 from dataclasses import dataclass
@@ -52,8 +52,7 @@ class Parameter:
 class Candidate:
     """An effect at a place, perhaps only under a condition. Hashable; equal if these are.
 
-    when: None, or a dict {'time': [from, to]} in the recording's time, with 'recording':
-    name if it is true of one recording only, or {'qpos:<joint>': [low, high]}, {'qvel:…': …}.
+    when: None, or {'recording': name, 'time': [from, to]}, in that recording's time.
     """
     effect: 'Effect'
     place: Place
@@ -82,6 +81,7 @@ class Effect:
     name = ''
     kinds = ()         # kinds of place; one instance for each, with the attribute `kind`
     constants = False  # edit() changes something that mj_setConst derives constants from
+    acts_through = ''  # what its force varies with: velocity, position, control or contact
     timed = False      # differs from a simpler effect only under a condition
     amplitudes = 0     # of an effect with probes: how many of its first parameters it acts in proportion to
     together = 1       # of an effect with probes: how many in a row are tried as one

@@ -157,10 +157,13 @@ class Engine:
         ctrl, qfrc, xfrc = ([np.array([getattr(d, f) for d in drives]) for drives in (on, off)]
                             for f in ('ctrl', 'qfrc', 'xfrc'))
         forces = [self._forces(drives) for drives in (on, off)]
-        holds, active = self._conditions(cases, recordings), None
+        always, never = (-np.inf, np.inf), (np.inf, np.inf)
+        low, high = np.array([always if not c.when else c.when['time'] if c.when['recording'] == r.name else never
+                              for c, r in zip(cases, recordings)]).T
+        active = None
         for k in range(out['qpos'].shape[1]):
             time = begin + k * step
-            now = holds(live['qpos'][:n], live['qvel'][:n], time)
+            now = (low <= time) & (time < high)
             if active is None or (now != active).any():
                 active = now
                 batch.set_models([(a if yes else b).model or self.model for a, b, yes in zip(on, off, active)] + spare)
@@ -196,31 +199,6 @@ class Engine:
             if function is not None:
                 forces.append((ids, function))
         return forces
-
-    def _conditions(self, cases, recordings):
-        """A function (qpos, qvel, time) -> (n,): whether each simulation's conditional effects act."""
-        always, groups = np.ones(len(cases), bool), {}
-        for s, (case, recording) in enumerate(zip(cases, recordings)):
-            for key, bounds in (case.when or {}).items():
-                if key == 'recording':
-                    always[s] = bounds == recording.name
-                else:
-                    groups.setdefault(key, []).append((s, *bounds))
-        groups = {key: [np.array(x) for x in zip(*members)] for key, members in groups.items()}
-
-        def holds(qpos, qvel, time):
-            active = always.copy()
-            for key, (ids, low, high) in groups.items():
-                kind, _, joint = key.partition(':')
-                if kind == 'time':
-                    x = time
-                elif kind == 'qpos':
-                    x = qpos[:, self.model.joint(joint).qposadr[0]]
-                else:
-                    x = qvel[:, self.model.joint(joint).dofadr[0]]
-                active[ids] &= (x[ids] >= low) & (x[ids] < high)
-            return active
-        return holds
 
     def _measures(self, cases):
         """(offset, ratio, delay) (3, n, ·) of the hinges and slides, and of sensordata."""

@@ -22,7 +22,7 @@ def write_whole(path, data):
 def write_together(files):
     """Write {path: text or bytes}, each under a temporary name beside it; the names change once all are on the disk.
 
-    Raises WriteError, and then leaves what was there before.
+    Raises WriteError, and then leaves what was there before (but where the change of names itself fails half-way).
     """
     waiting = {}
     try:
@@ -45,7 +45,7 @@ def write_together(files):
                 os.remove(partial)
         if not isinstance(error, OSError):
             raise
-        raise WriteError(f"cannot write {path}: {error.strerror or error}; free some space or choose another --out") from None
+        raise WriteError(f"cannot write {path}: {error.strerror or error}; free some space or choose another folder") from None
 
 
 def write_table(path, columns, rows):

@@ -212,16 +212,8 @@ def unit_of(model, channel):
     return "rad"
 
 
-# What the force of an effect varies with.
-VARIABLES = {"velocity": ("viscous_damping", "quadratic_damping", "coulomb_friction", "stribeck_friction", "back_emf"),
-             "position": ("stiffness", "nonlinear_stiffness", "joint_stop", "backlash", "cogging"),
-             "control": ("gain", "saturation", "dead_zone", "delay", "lag"),
-             "contact": ("contact_friction", "contact_stiffness", "contact_damping", "ground_height")}
-
-
 def depends_on(model, candidate):
-    variable = next((v for v, names in VARIABLES.items() if candidate.effect.name in names), None)
-    name = candidate.place.name
+    variable, name = candidate.effect.acts_through, candidate.place.name
     if variable == "velocity" and candidate.place.kind == "actuator":
         actuator = model.actuator(name)
         if actuator.trntype[0] not in JOINT_TRANSMISSIONS:  # a site or tendon moves with many joints

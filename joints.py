@@ -106,6 +106,7 @@ class Armature(JointNumber):
 class ViscousDamping(JointNumber):
     """Force −d·v."""
     name, types, simplicity, related = 'viscous_damping', (HINGE, SLIDE, BALL), 0, DISSIPATION
+    acts_through = 'velocity'
     number, compiled, authored = ('damping', 'N·m·s/rad', 'N·s/m'), ('dof_damping', None), ('damping', 0)
 
 
@@ -113,6 +114,7 @@ class ViscousDamping(JointNumber):
 class QuadraticDamping(JointNumber):
     """Force −d·v·|v|."""
     name, related = 'quadratic_damping', DISSIPATION
+    acts_through = 'velocity'
     number, compiled, authored = ('damping2', 'N·m·s²/rad²', 'N·s²/m²'), ('dof_dampingpoly', 0), ('damping', 1)
 
     def suited(self, parameters, model, i, recordings):
@@ -127,6 +129,7 @@ class QuadraticDamping(JointNumber):
 class CoulombFriction(JointNumber):
     """Dry friction, which holds the joint below its limit."""
     name, types, simplicity, related = 'coulomb_friction', (HINGE, SLIDE, BALL), 0, DISSIPATION
+    acts_through = 'velocity'
     number, compiled, authored = ('frictionloss', 'N·m', 'N'), ('dof_frictionloss', None), ('frictionloss', None)
     step = 0.05
 
@@ -147,6 +150,7 @@ class CoulombFriction(JointNumber):
 class Stiffness(JointNumber):
     """Force −k·(q − springref)."""
     name, related = 'stiffness', ('spring_offset', 'nonlinear_stiffness', 'gain')
+    acts_through = 'position'
     number, compiled, authored, step = ('stiffness', 'N·m/rad', 'N/m'), ('jnt_stiffness', None), ('stiffness', 0), 0.1
 
 
@@ -154,6 +158,7 @@ class Stiffness(JointNumber):
 class NonlinearStiffness(JointNumber):
     """Force −k·(q − springref)³."""
     name, simplicity, related = 'nonlinear_stiffness', 2, ('stiffness', 'spring_offset')
+    acts_through = 'position'
     number, compiled, authored = ('stiffness3', 'N·m/rad³', 'N/m³'), ('jnt_stiffnesspoly', 1), ('stiffness', 2)
     step, signed = 0.1, True
 
@@ -173,6 +178,7 @@ class StribeckFriction(JointEffect):
     a force that gives back what it is too much once moving; in MJCF with LuGre bristles.
     """
     name, simplicity, related, amplitudes = 'stribeck_friction', 3, DISSIPATION, 2
+    acts_through = 'velocity'
 
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, 'N·m', 'N')
@@ -253,6 +259,7 @@ class SpringOffset(JointEffect):
 class Cogging(JointEffect):
     """Force amplitude·sin(poles·q + phase), as of a motor's magnets."""
     name, simplicity, amplitudes, together = 'cogging', 3, 1, 2
+    acts_through = 'position'
 
     def fits(self, model, i):
         return super().fits(model, i) and self.driven(model, i)
@@ -307,6 +314,7 @@ class Cogging(JointEffect):
 class JointStop(JointEffect):
     """The joint is limited to [low, high]."""
     name, simplicity = 'joint_stop', 2
+    acts_through = 'position'
     NEVER = 1e6  # a bound that is never met
 
     def parameters(self, model, i):
@@ -346,6 +354,7 @@ class Backlash(JointEffect):
     needs inertia of its own: without armature it gets one per cent of the joint's.
     """
     name, simplicity, amplitudes = 'backlash', 3, 1
+    acts_through = 'position'
 
     def fits(self, model, i):
         body = model.jnt_bodyid[i]

@@ -49,8 +49,8 @@ def forces(model, qpos, qvel, qacc, ctrl):
 
 
 def residuals(diagnosis, most=1200):
-    """One dict per finding that can be drawn: finding (index), variable, x, before, after (n,), unit, x_unit. after: under
-    corrected.xml; NaN for a finding that it cannot hold."""
+    """One dict per finding that can be drawn: finding (index), variable, x, before, after (n,), unit, x_unit, joint (name). after:
+    under corrected.xml; NaN for a finding that it cannot hold."""
     nominal = diagnosis.world.model
     corrected = mujoco.MjModel.from_xml_string(diagnosis.corrected_xml)
     measured = [r.seen() for r in diagnosis.held_out if not np.isnan(r.qpos).all(axis=0).any()]
@@ -59,14 +59,14 @@ def residuals(diagnosis, most=1200):
     time, *states = (np.concatenate(x) for x in zip(*(smooth(nominal, r, most // len(measured) + 1) for r in measured)))
     if len(time) < 50:
         return []
-    before = forces(nominal, *states)
+    before, (qpos, qvel, _, ctrl) = forces(nominal, *states), states
     same = (corrected.nq, corrected.nv, corrected.na) == (nominal.nq, nominal.nv, 0)  # else its extra states are not known
     after = forces(corrected, *states) if same else np.full_like(before, np.nan)
     found = []
     for index, finding in enumerate(diagnosis.summary["findings"]):
         held = after if finding["written_as"] == "mjcf" else np.full_like(after, np.nan)
         for variable in finding["depends_on"][:2]:
-            x, joint, unit = _variable(nominal, variable, time, *states)
+            x, joint, unit = _variable(nominal, variable, time, qpos, qvel, ctrl)
             joint = _joint_of(nominal, finding["place"], joint)
             if x is None or joint is None:
                 continue
@@ -76,7 +76,7 @@ def residuals(diagnosis, most=1200):
     return found
 
 
-def _variable(model, variable, time, qpos, qvel, qacc, ctrl):
+def _variable(model, variable, time, qpos, qvel, ctrl):
     """(values (n,), joint id or None, unit) of "velocity:elbow", "control:motor", "time"; values None where unknown."""
     kind, _, name = variable.partition(":")
     if kind == "time":

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 
-import surroundings  # noqa: F401, I001  (their effects join the catalogue, in this order)
-from joints import JointEffect
+from joints import JointEffect  # noqa: I001  (effects join the catalogue in the order of these imports, as world.py's have it)
 import actuators     # noqa: F401
+import surroundings  # noqa: F401
 from effects import (EFFECTS, HINGE, HUGE, JOINT_TRANSMISSION, JOINT_TRANSMISSIONS, SLIDE, Candidate,  # noqa: F401  (EFFECTS to others)
                      Effect, Parameter, Place, authored, catalogue, constant_force, displace, explicit_inertia, turns)
 

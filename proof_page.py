@@ -9,10 +9,8 @@ import html
 import io
 import json
 
-import matplotlib
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from conceal import NAMED, seal
 from files import write_whole
@@ -137,13 +135,13 @@ def confusion(rows):
 def _picture(figure):
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", bbox_inches="tight")
-    plt.close(figure)
     return f'<img src="data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode()}" alt="">'
 
 
 def _confusion_figure(rows):
     truths, names, counts = confusion(rows)
-    figure, axis = plt.subplots(figsize=(0.26 * len(names) + 2, 0.24 * len(truths) + 2))
+    figure = Figure(figsize=(0.26 * len(names) + 2, 0.24 * len(truths) + 2))
+    axis = figure.subplots()
     axis.imshow(counts / np.maximum(counts.sum(1, keepdims=True), 1), cmap="Blues", vmin=0, vmax=1)
     for i, j in zip(*np.nonzero(counts)):
         axis.text(j, i, counts[i, j], ha="center", va="center", fontsize=7)
@@ -155,7 +153,8 @@ def _confusion_figure(rows):
 
 
 def _detection_figure(rows):
-    figure, axis = plt.subplots(figsize=(6, 3.2))
+    figure = Figure(figsize=(6, 3.2))
+    axis = figure.subplots()
     single = [r for r in rows if r["kind"] == "single"]
     for key, label, shift in (("found", "named or possible", -0.06), ("first", "first name", 0.06)):
         for k, (low, high) in enumerate(zip(EDGES, EDGES[1:])):
@@ -176,7 +175,8 @@ def _detection_figure(rows):
 
 
 def _error_figure(rows):
-    figure, axis = plt.subplots(figsize=(6, 4))
+    figure = Figure(figsize=(6, 4))
+    axis = figure.subplots()
     hidden = [r for r in rows if r["hidden"] and r["exit"] == "0" and np.isfinite(r["error_after"])]
     hidden.sort(key=lambda r: r["error_before"])
     for key, mark, label in (("error_before", "C3.", "before"),
@@ -189,7 +189,8 @@ def _error_figure(rows):
 
 
 def _interval_figure(rows):
-    figure, axis = plt.subplots(figsize=(6, 2.8))
+    figure = Figure(figsize=(6, 2.8))
+    axis = figure.subplots()
     scores = [(p["value"] - p["truth"]) / max((p["high"] - p["low"]) / 3.92, 1e-300)
               for r in rows for p in r["parameters"] if None not in (p["low"], p["high"])]
     if scores:

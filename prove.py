@@ -31,6 +31,7 @@ import mujoco
 import numpy as np
 from tqdm import tqdm
 
+import proof_page
 from conceal import DEPENDS_ON, FINAL_SEED, conceal, seal
 from files import write_table
 from hidden import Real
@@ -173,7 +174,7 @@ def reveal(trial, report, seed, number, done):
                                      held_out, answer["noise"], False)}
     try:
         row |= scored(trial, report, nominal) if done["exit"] == 0 else {}
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:  # the report's fault: it counts as no diagnosis
+    except (OSError, ValueError, KeyError, IndexError, TypeError, mujoco.FatalError) as error:  # the report's fault: it counts as no diagnosis
         row |= {"exit": 1, "note": f"the report cannot be scored: {type(error).__name__} {error}"[:300]}
     return {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
 
@@ -210,8 +211,6 @@ def again(row):
 def read(path):
     """Rows of a table of trials, as dicts of text."""
     csv.field_size_limit(10**8)
-    if not Path(path).exists():
-        return []
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
 
@@ -246,7 +245,7 @@ def run(seed, numbers, out, jobs):
     """Run the trials `numbers` of a seed that `out` does not hold yet."""
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    rows = read(out)
+    rows = read(out) if out.exists() else []
     done = {int(row["trial"]) for row in rows if int(row["seed"]) == seed}
     wanted = [number for number in numbers if number not in done]
     cores = Queue()                                  # one for each worker, lest threads wait for each other
@@ -255,9 +254,13 @@ def run(seed, numbers, out, jobs):
         cores.put(allowed[job % len(allowed)] if allowed and jobs > 1 else None)
     with ProcessPoolExecutor(jobs, initializer=_pin, initargs=(cores,)) as pool:
         futures = [pool.submit(run_trial, seed, number, f"{out}.sealed") for number in wanted]
-        for future in tqdm(as_completed(futures), total=len(futures), disable=not sys.stderr.isatty()):
-            rows.append(future.result())
-            write(out, rows)
+        try:
+            for future in tqdm(as_completed(futures), total=len(futures), disable=not sys.stderr.isatty()):
+                rows.append(future.result())
+                write(out, rows)
+        except BaseException:  # a fault: what has not begun is not sealed either
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def main():
@@ -280,6 +283,10 @@ def main():
     command.add_argument("table")
     command.add_argument("--out", required=True)
     arguments = parser.parse_args()
+    if arguments.command in ("score", "page"):
+        for path in (arguments.table, f"{arguments.table}.sealed"):
+            if not os.path.isfile(path) or not os.path.getsize(path):
+                parser.error(f"{path}: no such file, or empty; name a table that `prove.py run` made, with its seals beside it")
     if arguments.command == "run":
         run(arguments.seed, range(arguments.first, arguments.trials), arguments.out, arguments.jobs)
     elif arguments.command == "show":
@@ -291,7 +298,6 @@ def main():
         with ProcessPoolExecutor(cores()) as pool:
             write(arguments.table, list(tqdm(pool.map(again, read(arguments.table)), disable=not sys.stderr.isatty())))
     else:
-        import proof_page
         rows, seals = read(arguments.table), published(arguments.table)
         proof_page.write(rows, seals, arguments.out)
         for line in proof_page.lines([proof_page.parse(row, seals) for row in rows]):

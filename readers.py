@@ -115,7 +115,7 @@ def _resolve(path, header, model):
             elif f"{by_index.get(head)}:{component}" in known:
                 name = f"{by_index[head]}:{component}"
             else:
-                raise RecordingError(f"{path}: column {position} ({name!r}): {_unknown(name, known, model)}")
+                raise RecordingError(f"{path}: column {position} ({name!r}): {_unknown(name, known)}")
         if name in names:
             raise RecordingError(f"{path}: column {position} ({name!r}): stands twice in the header; remove one")
         names.append(name)
@@ -128,7 +128,7 @@ def _resolve(path, header, model):
     return names
 
 
-def _unknown(name, known, model):
+def _unknown(name, known):
     """Why a header cell is not a column of this model, and which one was perhaps meant."""
     if name == "":
         return "has no name; every column needs one"
@@ -281,7 +281,7 @@ def by_column(path, arrays, model):
         if array.dtype.kind not in "fiu":
             raise RecordingError(f"{path}: array {key!r} holds {array.dtype} instead of real numbers; save it as float64")
         if key not in widths and key != "time":
-            raise RecordingError(f"{path}: array {key!r}: {_unknown(key, known, model)}")
+            raise RecordingError(f"{path}: array {key!r}: {_unknown(key, known)}")
     time = np.asarray(arrays.pop("time"), dtype=float)
     if time.ndim == 2 and time.shape[1] == 1:
         time = time[:, 0]

@@ -77,12 +77,14 @@ def _folders(paths):
 def accepted(recording, model):
     """A Recording that somebody made in Python, as `load` would have made it. Raises RecordingError as `load` does; rows
     are counted from 0."""
-    arrays = {"time": recording.time, "qpos": recording.qpos, "qvel": recording.qvel, "ctrl": recording.ctrl}
-    arrays |= {f"sensor:{name}": values for name, values in recording.sensors.items()}
-    columns = by_column(recording.name, {key: np.asarray(values) for key, values in arrays.items()}, model)
-    made = _recording(recording.name, recording.name, columns, model, 0)
+    name, arrays = str(recording.name), {"time": recording.time, "qpos": recording.qpos, "ctrl": recording.ctrl}
+    if recording.qvel is not None:
+        arrays["qvel"] = recording.qvel
+    arrays |= {f"sensor:{sensor}": values for sensor, values in (recording.sensors or {}).items()}
+    columns = by_column(name, {key: np.asarray(values) for key, values in arrays.items()}, model)
+    made = _recording(name, name, columns, model, 0)
     if not 0 <= recording.start < len(made.time) - 1:
-        raise RecordingError(f"{recording.name}: start is row {recording.start} of {len(made.time)}; at least two rows have to "
+        raise RecordingError(f"{name}: start is row {recording.start} of {len(made.time)}; at least two rows have to "
                              "follow it")
     return replace(made, start=recording.start)
 
@@ -255,11 +257,11 @@ def _check_time(recording, model, warn):
                              "write seconds")
     row = int(np.argmin(steps))
     if steps[row] < 1e-4 * usual:
-        raise RecordingError(f"{where}: data row {row + 2} stands {steps[row]:.3g} s after the one before (others "
+        raise RecordingError(f"{where}: the row at {recording.time[row + 1]:.12g} s stands {steps[row]:.3g} s after the one before (others "
                              f"{usual:.3g} s); no velocity can be formed from these two, remove one")
     row = int(np.argmax(steps))
     if steps[row] > max(20 * usual, 0.1):
-        raise RecordingError(f"{where}: gap of {steps[row]:.3g} s after data row {row + 1}, at {recording.time[row]:.12g} s "
+        raise RecordingError(f"{where}: gap of {steps[row]:.3g} s after {recording.time[row]:.12g} s "
                              f"(rows are {usual:.3g} s apart); split the file there, or write the missing rows with nan "
                              "positions and their control")
     if steps[row] > 5 * usual:
@@ -302,8 +304,8 @@ def _check_values(recording, model, warn):
                 warn(recording, f"{column} does not move beyond the sensor's noise; nothing can be said about what only its "
                      "motion would show")
             if hinge and abs(jumps[row] - 2 * np.pi) < 0.5 and jumps[row] > 20 * np.median(jumps) + 1e-6:
-                raise RecordingError(f"{where}: jumps by {jumps[row]:.3g} rad after data row "
-                                     f"{np.flatnonzero(~missing)[row] + 1}, a wrapped angle; unwrap it (numpy.unwrap)")
+                raise RecordingError(f"{where}: jumps by {jumps[row]:.3g} rad after "
+                                     f"{recording.time[~missing][row]:.12g} s, a wrapped angle; unwrap it (numpy.unwrap)")
         else:
             limited, span = model.actuator_ctrllimited[k], model.actuator_ctrlrange[k]
         largest = max(abs(low), abs(high))

@@ -23,17 +23,23 @@ class Physics(Grounding):
         super().__init__(sim, settings)
         self.nominal, self.xml = sim, ""
 
-    def fit(self, tau_real, policy, seed):
+    def fit(self, tau_real, seed):
         """Line 3: from the raw simulator and all that was recorded so far, the simulator with the missing physics.
 
-        The last one stays where it predicts the recorded transitions better than the new one.
+        The last one stays where it predicts the recorded transitions better than the new one, or where that has
+        joints that the task does not know, as backlash and dead zones are written.
         """
         path = model_path(self.nominal.env_id)
         try:
             diagnosis = diagnose(path, recordings_of(self.nominal, tau_real))
         except (RecordingError, ModelError) as error:
             raise EnvError(f"no diagnosis from {len(tau_real)} real transitions: {error}") from None
-        error = lambda xml: one_step_error(self._simulator(xml), identity, tau_real)[0]
+
+        def error(xml):
+            try:
+                return one_step_error(self._simulator(xml), identity, tau_real)[0]
+            except EnvError:
+                return np.inf
         self.xml = min((diagnosis.corrected_xml, self.xml), key=error)
         return {}
 

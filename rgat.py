@@ -2,7 +2,7 @@
 
     sim = BatchEnv("Hopper-v4", 32)
     grounding = RGAT(sim, settings)
-    grounding.fit(tau_real, policy, seed)              # f_psi                        Algorithm 1, line 3
+    grounding.fit(tau_real, seed)                      # f_psi                        Algorithm 1, line 3
     grounding.update(policy, at_steps, seed)           # g_phi                        Algorithm 1, line 4
     grounded = GroundedEnv(sim, grounding.transformer)     # what the policy trains in    Algorithm 1, line 5
 
@@ -33,7 +33,7 @@ def identity(obs, action):
 
 
 class GroundedEnv(VectorWrapper):
-    """The grounded simulator (paper, Fig. 2 and 3a): the transformer acts before the sim, the reward sees a, not a_hat."""
+    """The grounded simulator (paper, Fig. 1 and 2a): the transformer acts before the sim, the reward sees a, not a_hat."""
 
     def __init__(self, env, transformer=identity):
         super().__init__(env)
@@ -109,7 +109,7 @@ class ActionTransformer:
 
 
 class ActionTransformerEnv(VectorEnv):
-    """The grounding step as a reinforcement learning problem (paper, section III and Fig. 3b).
+    """The grounding step as a reinforcement learning problem (paper, section III and Fig. 2b).
 
     The agent is g_phi: it observes (s, a), a ~ pi_theta(s), chooses delta_a, and is paid
     R_AT = -||f_psi(s, a) - s'||^2, each dimension in units of `scale`: how much it changes in a real step. In raw
@@ -184,7 +184,7 @@ class Grounding:
         self.transformer = identity
         self.scale = np.ones(self.nobs, np.float32)
 
-    def fit(self, tau_real, policy, seed):
+    def fit(self, tau_real, seed):
         """Line 3: learn a model of the real dynamics. Returns statistics for progress.csv."""
         return {}
 
@@ -216,7 +216,7 @@ class RGAT(Grounding):
         self.real_model = RealModel(sim, settings.residual)
         self._new_transformer()
 
-    def fit(self, tau_real, policy, seed):
+    def fit(self, tau_real, seed):
         self.seen = tau_real
         self._measure_scale(tau_real)
         return {"forward_model_error": relative(self.real_model.fit(tau_real, seed), tau_real)}
@@ -263,7 +263,7 @@ class GAT(Grounding):
         self.real_model = RealModel(sim, settings.residual)
         self.inverse_model = InverseModel(self.nobs, self.nact)
 
-    def fit(self, tau_real, policy, seed):
+    def fit(self, tau_real, seed):
         self.seen = tau_real
         return {"forward_model_error": relative(self.real_model.fit(tau_real, seed), tau_real)}
 
@@ -329,7 +329,7 @@ class Oracle(Grounding):
         self.trial = Batch(sim.model, sim.num_envs * 2, nthread)
         self.transformer = self._transform
 
-    def fit(self, tau_real, policy, seed):
+    def fit(self, tau_real, seed):
         self._measure_scale(tau_real)
         return {}
 

@@ -56,9 +56,10 @@ def versions():
 class Run:
     """The folder of one run.
 
-    config.json, progress.csv (a row per grounding step), train.csv (a row per TRPO update), step_NN.pt
-    (checkpoints), real_NN.npz (the real transitions collected before step NN), policy.pt (the best policy so
-    far on real), progress.png.
+    config.json (settings and versions), progress.csv (a row per grounding step), train.csv (a row per TRPO update),
+    step_NN.pt (checkpoints), real_NN.npz (the real transitions collected in step NN), policy.pt (the best policy so far
+    on real), best.json (that policy judged once more), lines.json (reference returns), progress.png, replay.gif if asked
+    for, and ENV-sim-KEY.pt or ENV-real-KEY.pt, policies trained from scratch, where no other folder keeps them.
     """
 
     def __init__(self, folder):
@@ -114,7 +115,7 @@ class Run:
         self.plot()
 
     def record(self, row, checkpoint, real=None):
-        """Finish a grounding step: its checkpoint first, its progress row last, so that a row means a whole step."""
+        """Finish a grounding step: its data and checkpoint first, its progress row last, so that a row means a whole step."""
         step = row["grounding_step"]
         if real is not None:
             data = io.BytesIO()
@@ -137,14 +138,16 @@ class Run:
             raise RunError(f"{error}; start a new run") from None
 
     def policy(self):
-        """The best policy so far. Raises RunError if its file is missing or damaged."""
+        """The best policy so far. Raises RunError if there is none yet, or its file is missing or damaged."""
+        if not self.progress:
+            raise RunError(f"{self.folder} has no policy yet: go on with --resume {self.folder}")
         try:
             return GaussianPolicy.load(self.folder / "policy.pt")
         except ValueError as error:
             raise RunError(f"{self.folder}: {error}; start a new run") from None
 
     def real(self, step):
-        """The arrays s, a, s_next collected before a step. Raises RunError if they are missing or damaged."""
+        """The arrays s, a, s_next collected in a step. Raises RunError if they are missing or damaged."""
         path = self.folder / f"real_{step:02d}.npz"
         try:
             with np.load(path, allow_pickle=False) as data:

@@ -278,7 +278,8 @@ class Scan:
         return abs(total[i, j]) > 0.998 * np.sqrt(total[i, i] * total[j, j])
 
     def whole(self, fit, candidate):
-        """Cluster sums of the columns [other parameters..., the whole effect from fitted to absent], and chi2.
+        """Gram and score sums by cluster of the columns [other parameters..., the whole effect from fitted to absent], those
+        left out that show nothing; chi2; and whether the whole effect shows anything.
 
         The whole effect as one column needs no derivative, which limits and delays lack.
         """

@@ -1,6 +1,6 @@
 """Is a gain real? Statistics of projected columns that respect correlated residuals.
 
-Everything works on a shooting.Scan: per window the score s = C'r and Gram matrix G = C'C of the projected columns C.
+Everything works on a shooting.Normal: per window the score s = C'r and Gram matrix G = C'C of the projected columns C.
 Residuals inside a window, and in neighbouring windows, are correlated; so windows are gathered into clusters and the
 variance of the score is measured between clusters (sandwich), never taken from chi-square.
 """

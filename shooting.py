@@ -194,7 +194,7 @@ def _propose(fit, slope, moves, damping, robust):
 
 
 @dataclass
-class Scan:
+class Normal:
     """Projected normal equations of many columns, one row per piece of a window (P = W x pieces)."""
 
     chi2: np.ndarray  # (P,) what is left of the residual
@@ -203,7 +203,7 @@ class Scan:
 
 
 def project(problem, fit, slope, pieces=1):
-    """Scan of columns slope (W, m, K) against a fit's residual, start states projected out.
+    """Normal equations of columns slope (W, m, K) against a fit's residual, start states projected out.
 
     pieces: a window's rows are summed in this many consecutive pieces (more than one where windows are few).
     """
@@ -217,4 +217,4 @@ def project(problem, fit, slope, pieces=1):
             c, r = columns[owner == piece], residual[owner == piece]
             chi2[w, piece], score[w, piece], gram[w, piece] = r @ r, r @ c, c.T @ c
     flat = lambda x: x.reshape((number * pieces,) + x.shape[2:])
-    return Scan(flat(chi2), flat(score), flat(gram))
+    return Normal(flat(chi2), flat(score), flat(gram))

@@ -102,7 +102,7 @@ class ContactEffect(Effect):
     A pair's friction is the larger of the two and its solref a mixture, so the
     geom first takes over what its pair has nominally.
     """
-    kinds = ('geom',)
+    kinds, acts_through = ('geom',), 'contact'
 
     def fits(self, model, i):
         return self.partner(model, i) is not None
@@ -213,7 +213,7 @@ class ContactDamping(ContactEffect):
 @catalogue
 class GroundHeight(Effect):
     """A fixed geom lies higher or lower."""
-    name, kinds, constants = 'ground_height', ('geom',), True
+    name, kinds, constants, acts_through = 'ground_height', ('geom',), True, 'contact'
 
     def fits(self, model, i):
         return model.body_weldid[model.geom_bodyid[i]] == 0 and ContactEffect.partner(model, i) is not None

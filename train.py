@@ -28,12 +28,17 @@ from trpo import PRESETS, TRPO, Transitions, rollouts
 from world import quiet
 
 # settings that suit each task, where the command line does not say
-BY_TASK = ("pretrain_steps", "reference_steps", "grounding_steps", "at_steps", "policy_steps", "at_std")
+LARGE = dict(pretrain_steps=1_000_000, reference_steps=1_000_000, at_steps=200_000, policy_steps=250_000, at_std=0.01)
 DEFAULTS = {
-    "InvertedPendulum": dict(zip(BY_TASK, (80_000, 200_000, 5, 50_000, 20_000, 0.05))),
-    "Hopper": dict(zip(BY_TASK, (1_000_000, 1_000_000, 10, 200_000, 250_000, 0.01))),
-    "HalfCheetah": dict(zip(BY_TASK, (1_000_000, 1_000_000, 20, 200_000, 250_000, 0.01))),
+    "InvertedPendulum": dict(
+        grounding_steps=5, pretrain_steps=80_000, reference_steps=200_000, at_steps=50_000, policy_steps=20_000, at_std=0.05
+    ),
+    "Hopper": dict(grounding_steps=10, **LARGE),
+    "HalfCheetah": dict(grounding_steps=20, **LARGE),
 }
+
+
+UNSOUND = AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError  # what a checkpoint of something else raises
 
 
 def option(default, help, **extra):
@@ -126,14 +131,14 @@ def algorithm_1(s, run, bar):
     learner, grounding, tau_real = start(s, run, sim, real, bar)
     policy = learner.policy
 
-    for step in range(len(run.progress), s.grounding_steps + 1):  # 1: while the policy improves on real
+    for step in range(len(run.progress), s.grounding_steps + 1):  # 1: while the policy improves on real: here a fixed number of times
         seeds = lambda purpose: seed_for(s.seed, step, purpose)
-        tau_new = collect(s, grounding, policy, real, seeds("collect"))  # 2: collect tau_real
-        tau_real += tau_new
-        stats = grounding.fit(tau_real, policy, seeds("model"))  # 3: train f_psi with tau_real
-        stats |= transform(s, grounding, policy, sim, real, seeds, bar.phase(step, "transformer"))  # 4: update g_phi
+        tau_new = collect(s, grounding, policy, real, seeds("collect"))  # 2: collect tau_real ...
+        tau_real += tau_new  # ... and keep what was collected before
+        stats = grounding.fit(tau_real, seeds("model"))  # 3: train f_psi with tau_real
+        stats |= update_transformer(s, grounding, policy, sim, real, seeds, bar.phase(step, "transformer"))  # 4: update g_phi by optimize1
         grounded_sim = GroundedEnv(grounding.sim, grounding.transformer)
-        learner.learn(grounded_sim, s.policy_steps, seeds("policy"), on_update=bar.phase(step, "policy"))  # 5: update pi_theta
+        learner.learn(grounded_sim, s.policy_steps, seeds("policy"), on_update=bar.phase(step, "policy"))  # 5: update pi_theta by optimize2
         record(s, run, step, learner, grounding, real, tau_new, stats, bar)  # 6: end while; the run keeps the best policy
 
 
@@ -153,9 +158,9 @@ def nothing(env):
     return Transitions(s, a, s)
 
 
-def transform(s, grounding, policy, sim, real, seeds, log):
-    """A new action transformer, and its statistics: among them the one-step errors with it and without, on real
-    transitions that nothing was fitted on."""
+def update_transformer(s, grounding, policy, sim, real, seeds, log):
+    """The action transformer goes on (or begins anew, as the method has it). Returns its statistics: among them the one-step
+    errors with it and without, on real transitions that nothing is fitted on and that no column counts."""
     stats = grounding.update(policy, s.at_steps, seeds("transformer"), log)
     held_out = rollouts(policy, real, s.eval_episodes, seeds("held out"))[1]
     error, change = one_step_error(grounding.sim, grounding.transformer, held_out)
@@ -209,7 +214,7 @@ def start(s, run, sim, real, bar):
             learner.load(saved["learner"])
             if done:
                 grounding.load(saved["grounding"])
-        except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
+        except UNSOUND:
             raise RunError(f"{run.folder}/step_{done:02d}.pt does not belong to this run: start a new one") from None
         for step in range(1, done + 1):
             tau_real += Transitions(*run.real(step))
@@ -258,7 +263,7 @@ def pretrained(s, world, env, steps, bar):
         bar.skip(-(-steps // whole) * whole, counts=world == bar.world)
         try:
             learner.load(load_checkpoint(path))
-        except (ValueError, KeyError, TypeError, RuntimeError):
+        except UNSOUND:
             raise RunError(f"{path} holds no trained policy of this program: delete it") from None
         return learner.state()
     try:
@@ -329,16 +334,18 @@ def parse(argv):
     """The parsed command line: every field of Settings, and what to do with which run. Raises RunError where it makes no sense."""
     parser = Parser(prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for f in dataclasses.fields(Settings):
-        shown = "" if f.default is None else f" (default: {f.default})"
+        shown = "" if f.default in (None, "") or "(default:" in f.metadata["help"] else f" (default: {f.default})"
         extra = {k: v for k, v in f.metadata.items() if k != "help"}
         parser.add_argument(f"--{f.name.replace('_', '-')}", type=kind_of(f), default=f.default, help=f.metadata["help"] + shown, **extra)
     parser.add_argument("--out", help="folder of the run (default: runs/ENV-ALGO-sSEED)")
     parser.add_argument("--resume", metavar="RUN", help="continue the run in this folder, with the settings it began with")
     parser.add_argument("--replay", metavar="RUN", help="animate the best policy of this run on sim and real, to RUN/replay.gif")
     args = parser.parse_args(argv)
-    given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default]
+    given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default] + ["out"] * (args.out is not None)
     if given and (args.resume or args.replay):
-        raise RunError(f"--{given[0].replace('_', '-')} cannot be changed: a run goes on with the settings it began with; leave it out")
+        raise RunError(f"--{given[0].replace('_', '-')} cannot be changed: a run goes on in its folder with the settings it began with; leave it out")
+    if args.resume and args.replay:
+        raise RunError("--resume and --replay are two things to do: give one of them")
     return args
 
 

@@ -9,6 +9,8 @@ A window is (recording, first row, last row), both rows inside. Position differe
 tangent space of the joints (nv numbers), so that quaternions need no special case further up.
 """
 
+import math
+
 import mujoco
 import numpy as np
 
@@ -231,7 +233,7 @@ def difference_noise(column):
             d = np.diff(column[::stride], order)
             if len(d) < 5:
                 break
-            gain = np.sqrt(np.sum([_binomial(order, k) ** 2 for k in range(order + 1)]))
+            gain = np.sqrt(math.comb(2 * order, order))
             estimates.append(np.quantile(np.abs(d), 0.8) / 1.2816 / gain)
         if not estimates:
             break
@@ -242,13 +244,6 @@ def difference_noise(column):
         step = np.abs(np.diff(column))
         best = step[step > 0].min(initial=np.inf) / np.sqrt(12)
     return best
-
-
-def _binomial(n, k):
-    out = 1
-    for i in range(k):
-        out = out * (n - i) // (i + 1)
-    return out
 
 
 def measurement_noise(model, recordings):

@@ -26,20 +26,20 @@ CHUNK_BYTES = 64e6  # of trajectory in memory at a time
 
 
 class Window(NamedTuple):
-    """Rows first..last, both included, of a recording (anything with name, time (T,) and ctrl (T, nu))."""
+    """Rows first..last, both included, of a Recording (recordings.py)."""
     recording: object
     first: int
     last: int
 
 
 class World:
-    """`model` is the nominal MjModel, `candidates` the whole catalogue on it, `title` where it came from.
+    """`model` is the nominal MjModel, `candidates` the whole catalogue on it.
 
     A joint, actuator, body, geom or sensor without a name is named by its index.
     """
 
-    def __init__(self, spec, title='model'):
-        self.title, self.spec = title, spec.copy()
+    def __init__(self, spec):
+        self.spec = spec.copy()
         with quiet():
             self.spec.compile()
             s = self.spec
@@ -76,7 +76,7 @@ class World:
         """The World of an MJCF file. ValueError, of one line, if it does not compile."""
         try:
             with quiet():
-                world = cls(mujoco.MjSpec.from_file(str(path)), Path(path).name)
+                world = cls(mujoco.MjSpec.from_file(str(path)))
                 mujoco.MjSpec.from_string(world.corrected_xml({})[0]).compile()  # before the work: can it be written as one file?
             return world
         except ValueError as error:
@@ -97,9 +97,7 @@ class World:
             env.close()
         if path is None:
             raise ValueError(f'{env_id} is not a MuJoCo environment')
-        world = cls.load(path)
-        world.title = env_id
-        return world
+        return cls.load(path)
 
     def candidate(self, effect, place):
         """The Candidate of an effect and a place, by their names; KeyError if it cannot sit there."""
@@ -206,7 +204,8 @@ class World:
         held. Values keep all their digits; paths of meshes and other files become absolute.
         """
         spec, written = self.spec.copy(), {candidate: 'mjcf' for candidate in setting}
-        for candidate, values in Case(self.model, setting, 1).on:
+        time_step_first = lambda item: item[0].effect.name != 'time_step'  # delays, lags and friction are written by it
+        for candidate, values in sorted(Case(self.model, setting, 1).on, key=time_step_first):
             i = candidate.effect.id(self.model, candidate.place.name)
             written[candidate] = 'none' if candidate.when else candidate.effect.write(spec, self.model, i, values)
         for actuator in spec.actuators:  # the history must reach back far enough, whatever the time step became

@@ -83,7 +83,7 @@ def ground(s, v, sim, real, policy, tau_real, seed):
         at = dataclasses.replace(AT_CONFIG, max_kl=v["at_max_kl"], gamma=v["at_gamma"])
         settings = dataclasses.replace(settings, at=at, at_std=v["at_std"], residual=v["forward_model"] == "residual")
     grounding = method(world, settings, real.model) if v["method"] == "oracle" else method(world, settings)
-    fit = grounding.fit(tau_real, policy, seed)
+    fit = grounding.fit(tau_real, seed)
     grounding.update(policy, s.at_steps, seed)
     return grounding, world, fit
 

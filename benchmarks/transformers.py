@@ -42,7 +42,7 @@ def measure(seeds):
             pick = np.linspace(0, len(held_out) - 1, POINTS).astype(int)
             for algo in ("gat", "rgat"):
                 grounding = METHODS[algo](sim, GroundingSettings(at_std=s.at_std, residual=True))
-                grounding.fit(tau_real, learner.policy, seed)
+                grounding.fit(tau_real, seed)
                 grounding.update(learner.policy, s.at_steps, seed)
                 a_hat = transformed(sim, grounding.transformer, held_out[pick])
                 a = held_out.a[pick, 0]

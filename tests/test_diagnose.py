@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -14,7 +15,7 @@ sys.path.insert(0, ROOT)
 import diagnose
 import evidence
 import wording
-from recordings import Recording, RecordingError
+from recordings import Recording, RecordingError, accepted
 from tests.malformed import ARM, cases, run, text
 from tests.test_report import contract
 from world import World
@@ -69,6 +70,21 @@ def test_split_keeps_back_every_third_or_the_last_part():
     np.testing.assert_array_equal(held[0].time, many[0].time)  # what led there stays
     train, held = diagnose.split(many[:2])
     assert [r.name for r in train] == ["0", "1"] == [r.name for r in held]
+    [early], [late] = diagnose.split([dataclasses.replace(many[0], start=40)])  # one that was held out before
+    assert len(early.seen().time) == 35 and len(late.seen().time) == 10
+
+
+def test_what_a_recording_made_in_python_need_not_have():
+    made = dataclasses.replace(recording(50, Path("run 1")), qvel=None, sensors=None)
+    got = accepted(made, mujoco.MjModel.from_xml_string(INTEGRATOR.replace("<actuator>", "<!--").replace("</actuator>", "-->")))
+    assert got.name == "run 1" and np.isnan(got.qvel).all() and got.sensors == {}
+
+
+def test_a_folder_that_is_named_like_an_environment(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("InvertedPendulum-v4").mkdir()
+    with pytest.raises(RecordingError, match="nowhere.csv"):  # the model is found, so that this is what is missing
+        diagnose.diagnose("InvertedPendulum-v4", ["nowhere.csv"])
 
 
 INTEGRATOR = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint name="j" axis="0 1 0" damping="0.3"/>
@@ -100,7 +116,7 @@ def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
     ({"ctrl": np.full((400, 2), np.nan)}, "made.py: row 0, column 'ctrl:shoulder_motor': nan; every row needs its control"),
     ({"time": 1 - 0.01 * np.arange(400)}, "made.py: row 1, column 'time': 0.99 runs backward from 1;"),
     ({"qpos": np.zeros((400, 3))}, "made.py: array 'qpos' has shape (400, 3) instead of (400, 2); this model has 2 of them"),
-    ({"qvel": None}, "made.py: array 'qvel' holds object instead of real numbers"),
+    ({"qvel": np.full((400, 2), None)}, "made.py: array 'qvel' holds object instead of real numbers"),
     ({"start": 399}, "made.py: start is row 399 of 400"),
 ])
 def test_recordings_made_in_python_are_checked_too(change, says):

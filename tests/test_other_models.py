@@ -96,7 +96,7 @@ def test_controls_of_actuators_after_a_passive_one():
     passive = PENDULUM.replace("<actuator>", '<actuator><dcmotor name="brake" joint="j" motorconst="0.05" resistance="2" input="none"/>')
     model, ctrl = mujoco.MjModel.from_xml_string(passive), np.arange(3.0)[:, None]
     assert model.nactuator == 2 and model.nu == 1
-    values, *_ = _variable(model, "control:pull", None, None, None, None, ctrl)
+    values, *_ = _variable(model, "control:pull", None, None, None, ctrl)
     assert (values == ctrl[:, 0]).all()
 
 

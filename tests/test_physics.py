@@ -79,6 +79,18 @@ def test_all_effects_together_are_the_same_in_mjcf(case):
     np.testing.assert_allclose(stock(corrected, world, recording, *START, 20), qpos, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize('kind, effect, place, values', [
+    ('euler', 'delay', 'bend', (0.0015,)), ('rk4', 'delay', 'bend', (0.0015,)), ('rk4', 'lag', 'bend', (0.0008,)),
+    ('motors', 'stribeck_friction', 'elbow', (0.1, 0.2, 0.3))])
+def test_what_is_written_by_the_time_step_is_by_the_corrected_one(kind, effect, place, values):
+    """Beside a finer time step an effect is written as into a model that had it from the beginning."""
+    world, xml = arm(kind)
+    fine = World(mujoco.MjSpec.from_string(xml.replace('timestep="0.002"', 'timestep="0.001"')))
+    together = {world.candidate(effect, place): values, world.candidate('time_step', 'world'): (0.001,)}
+    alone = {fine.candidate(effect, place): values}
+    assert world.corrected_xml(together)[0] == fine.corrected_xml(alone)[0] != world.corrected_xml({})[0]
+
+
 def test_stribeck_friction_in_mjcf_and_by_hand():
     """Bristles, frictionloss with a force, and the law itself at a fine step agree through reversals and sticking."""
     world, (coulomb, static, velocity) = pendulum(), (0.1, 0.2, 0.3)

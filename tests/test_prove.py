@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 import json
 from pathlib import Path
+import sys
 
 from hypothesis import given, settings, strategies as st
 import mujoco
@@ -411,8 +412,29 @@ def test_run_resumes_and_the_page_is_whole(tmp_path, monkeypatch):
     assert page.endswith("</html>") and "0/6" in page and "http" not in page.replace("http://www.w3.org", "")
 
 
-def test_final_seed_is_no_development_seed():
-    assert conceal.FINAL_SEED not in conceal.DEVELOPMENT_SEEDS
+@pytest.mark.parametrize("command", ["score", "page"])
+@pytest.mark.parametrize("there", [None, "", "seed,trial\n"])
+def test_a_table_that_is_not_there_or_empty_is_named_and_none_is_made(command, there, tmp_path, monkeypatch, capsys):
+    table = tmp_path / "proof.csv"
+    if there is not None:
+        table.write_text(there)
+    monkeypatch.setattr(sys, "argv", ["prove.py", command, str(table), *(["--out", str(tmp_path / "page.html")] if command == "page" else [])])
+    with pytest.raises(SystemExit) as leave:
+        prove.main()
+    assert leave.value.code == 2 and str(table) in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["proof.csv"] * (there is not None)
+
+
+def test_a_fault_in_one_trial_leaves_the_others_for_later(tmp_path, monkeypatch):
+    """What has not begun is neither sealed nor run once one has failed."""
+    def trial(seed, number, sealed):
+        Path(f"{sealed}.{number}").touch()
+        raise RuntimeError("no sane experiment")
+    monkeypatch.setattr(prove, "run_trial", trial)
+    monkeypatch.setattr(prove, "ProcessPoolExecutor", lambda jobs, initializer, initargs: ThreadPoolExecutor(jobs))
+    with pytest.raises(RuntimeError, match="no sane"):
+        prove.run(1, range(200), tmp_path / "proof.csv", 1)
+    assert len(list(tmp_path.iterdir())) < 100
 
 
 def test_a_report_that_cannot_be_scored_counts_as_no_diagnosis(tmp_path):

@@ -52,7 +52,7 @@ def test_the_heavy_pole_is_found_and_put_into_the_simulator():
     real = BatchEnv("InvertedPendulum-v4", 4, parse_perturbation("pole:mass=100"), nthread=1)
     tau, held_out = transitions(real, 12), transitions(real, 4, seed=1)
     grounding = Physics(sim)
-    grounding.fit(tau, None, 0)
+    grounding.fit(tau, 0)
     grounding.update(None, 1, 0)
     model = mujoco.MjModel.from_xml_string(grounding.xml)
     assert abs(model.body("pole").mass[0] - 100) < 2
@@ -67,16 +67,19 @@ def test_a_diagnosis_that_predicts_worse_than_the_last_is_not_taken(monkeypatch)
     sim = BatchEnv("InvertedPendulum-v4", 4, nthread=1)
     real = BatchEnv("InvertedPendulum-v4", 4, parse_perturbation("pole:mass=20"), nthread=1)
     tau, grounding = transitions(real, 4), Physics(sim)
-    for mass, kept in ((12, 12), (100, 12), (20, 20)):
-        monkeypatch.setattr("remodel.diagnose", lambda path, recordings: SimpleNamespace(corrected_xml=with_pole(mass)))
-        grounding.fit(tau, None, 0)
+    for mass, joints, kept in ((12, 0, 12), (100, 0, 12), (20, 1, 12), (20, 0, 20)):
+        monkeypatch.setattr("remodel.diagnose", lambda path, recordings: SimpleNamespace(corrected_xml=with_pole(mass, joints)))
+        grounding.fit(tau, 0)
         assert mujoco.MjModel.from_xml_string(grounding.xml).body("pole").mass[0] == pytest.approx(kept)
 
 
-def with_pole(mass):
+def with_pole(mass, joints):
+    """MJCF of the pendulum with a pole of that mass, and as many joints more, as backlash has one."""
     spec = mujoco.MjSpec.from_file(str(model_path("InvertedPendulum-v4")))
     [geom] = spec.body("pole").geoms
     geom.mass = mass
+    for _ in range(joints):
+        spec.body("pole").add_joint(name="play", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0], limited=False)
     return spec.to_xml()
 
 
@@ -84,4 +87,4 @@ def test_too_little_to_diagnose_is_said_in_a_line():
     sim = BatchEnv("InvertedPendulum-v4", 1, nthread=1)
     tau = transitions(sim, 1)[:3]
     with pytest.raises(EnvError, match="no diagnosis from 3 real transitions"):
-        Physics(sim).fit(tau, None, 0)
+        Physics(sim).fit(tau, 0)

@@ -180,7 +180,7 @@ def test_gat_smooths_the_inverse_models_action():
     sim, tau = world("InvertedPendulum-v4"), real_data("InvertedPendulum-v4", 30)
     policy = policy_for(sim)
     grounding = GAT(sim, SMALL)
-    assert 0 < grounding.fit(tau, policy, 0)["forward_model_error"] < 1
+    assert 0 < grounding.fit(tau, 0)["forward_model_error"] < 1
     assert grounding.update(policy, 400, 0)["sim_transitions"] >= min(400, len(tau))
     obs, _ = sim.reset(seed=1)
     a = np.array([[-1.0], [0.5], [0.0], [2.0]])
@@ -200,7 +200,7 @@ def test_the_units_of_the_reward_are_of_a_real_step_unless_told():
     scales = []
     for per_step in (True, False):
         grounding = RGAT(sim, replace(SMALL, per_step=per_step))
-        grounding.fit(tau, policy_for(sim), 0)
+        grounding.fit(tau, 0)
         scales.append(grounding.scale)
     np.testing.assert_allclose(scales[0], np.sqrt(np.mean((tau.s_next - tau.s) ** 2, axis=0)), rtol=1e-3)
     np.testing.assert_array_equal(scales[1], np.ones(4))
@@ -211,7 +211,7 @@ def test_rgat_learns_repeats_and_reloads():
     for _ in range(2):
         sim = world("InvertedPendulum-v4")
         grounding, policy = RGAT(sim, SMALL), policy_for(sim)
-        fitted, rows = grounding.fit(tau, policy, 0), []
+        fitted, rows = grounding.fit(tau, 0), []
         learnt = grounding.update(policy, 256, 0, rows.append)
         results.append((fitted, learnt, [p.detach().clone() for p in grounding.learner.policy.parameters()]))
     assert results[0][:2] == results[1][:2] and len(rows) == 4

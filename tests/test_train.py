@@ -385,6 +385,13 @@ def test_a_broken_or_foreign_run_is_refused_and_left_alone(how, tmp_path, capfd,
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize(
+    "line, says", [(["--out", "runs/b"], "--out cannot be changed"), (["--replay", "runs/b"], "give one of them")]
+)
+def test_requests_that_contradict_themselves(line, says, capfd):
+    refused(["--resume", "runs/a", *line], capfd, says)
+
+
 def test_a_broken_shared_policy_is_named(tmp_path, capfd, finished):
     shared = tmp_path / "shared"
     options = ["--pretrained", str(shared), "--grounding-steps", "0"]
