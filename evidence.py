@@ -25,9 +25,9 @@ def consecutive(recordings, horizon):
     return [w for r in recordings for w in cut.consecutive(r, horizon, r.start)]
 
 
-def prediction_error(world, settings, recordings, noise, horizon=cut.HORIZON):
+def prediction_error(world, settings, recordings, noise):
     """(error over all channels in noises, {channel: error in SI})."""
-    windows = consecutive(recordings, horizon)
+    windows = consecutive(recordings, cut.HORIZON)
     return cut.error(world.model, windows, predict(world, settings, windows)[0], noise)
 
 
@@ -45,14 +45,14 @@ def floor_error(world, settings, recordings, position_noise, velocity_noise):
     return float(np.sqrt(total.sum() / count)), per_channel, float(scatter)
 
 
-def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON, seed=0):
+def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON):
     """What a perfect simulator would miss in the windows, or some of many: (DRAWS W, T, nv), NaN where nothing was measured.
 
     The corrected model from start states fitted to the first 0.3 s, from one row before each window on, stands for the
     truth. It is measured anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
     by differences; DRAWS times, for noise alone makes this vary.
     """
-    rng, model = np.random.default_rng(seed), world.model
+    rng, model = np.random.default_rng(0), world.model
     windows = sparse(consecutive(recordings, horizon))
     early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
     ends = [int(np.searchsorted(w.recording.time, w.recording.time[w.first] + cut.HORIZON * (1 + 1e-6), "right")) - 1 for w in windows]
@@ -134,11 +134,11 @@ def _rms(x):
     return float(np.sqrt(np.mean(x**2))) if len(x) else None
 
 
-def traces(world, settings, recordings, horizon=cut.HORIZON, most=3):
-    """[{recording, channel, time, measured, nominal, corrected}] of held-out data; predictions break (NaN) at window starts."""
+def traces(world, settings, recordings):
+    """[{recording, channel, time, measured, nominal, corrected}] of some held-out recordings; predictions break (NaN) at window starts."""
     out, model = [], world.model
-    for recording in recordings[:most]:
-        windows = cut.consecutive(recording, horizon, recording.start)
+    for recording in recordings[:3]:
+        windows = cut.consecutive(recording, cut.HORIZON, recording.start)
         lines = [_stitched(predict(world, s, windows)[0], windows) for s in ({}, settings)]
         rows = np.concatenate([np.arange(w.first, w.last + 1) for w in windows])
         for j, _, q, _ in cut.joint_slices(model):

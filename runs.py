@@ -238,13 +238,17 @@ class Bar:
 # --- replay: the planar robots drawn from their geoms, with no need of OpenGL ------------------------
 
 
-def draw(model, data, x, title, size=(400, 300), scale=110):
+SIZE, SCALE = (400, 300), 110  # of a frame in pixels, and pixels per metre
+MOST, EVERY = 500, 4  # steps shown, and steps per frame
+
+
+def draw(model, data, x, title):
     """One frame: every capsule of the model projected on the x-z plane, the camera at x."""
-    image = Image.new("RGB", size, "#f7f7f4")
+    image = Image.new("RGB", SIZE, "#f7f7f4")
     pen = ImageDraw.Draw(image)
-    to_pixel = lambda p: (size[0] / 2 + scale * (p[0] - x), size[1] * 0.82 - scale * p[2])
+    to_pixel = lambda p: (SIZE[0] / 2 + SCALE * (p[0] - x), SIZE[1] * 0.82 - SCALE * p[2])
     ground = to_pixel((0, 0, 0))[1]
-    pen.rectangle((0, ground, *size), fill="#dcd9cf")
+    pen.rectangle((0, ground, *SIZE), fill="#dcd9cf")
     for mark in np.arange(np.floor(x) - 3, x + 4, 0.5):
         pen.line((to_pixel((mark, 0, 0)), (to_pixel((mark, 0, 0))[0], ground + 6)), fill="#8f8b80")
     for geom in range(model.ngeom):
@@ -254,25 +258,25 @@ def draw(model, data, x, title, size=(400, 300), scale=110):
         axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * half
         ends = [to_pixel(data.geom_xpos[geom] + sign * axis) for sign in (-1, 1)]
         color = "#8f8b80" if model.geom_bodyid[geom] == 0 else "#1f5fa8"
-        pen.line(ends, fill=color, width=max(1, round(2 * radius * scale)))
+        pen.line(ends, fill=color, width=max(1, round(2 * radius * SCALE)))
         for px, pz in ends:
-            r = radius * scale
+            r = radius * SCALE
             pen.ellipse((px - r, pz - r, px + r, pz + r), fill=color)
     pen.text((8, 6), title, fill="#222222")
     return image
 
 
-def animate(policy, worlds, path, seed=0, max_steps=500, every=4):
+def animate(policy, worlds, path):
     """A GIF of a policy acting in each of the worlds {title: BatchEnv with one environment}, side by side.
 
-    Each world stops moving when its episode ends. Returns the returns reached within max_steps, by title.
+    Each world stops moving when its episode ends. Returns the returns reached within MOST steps, by title.
     """
     strips, returns = [], {}
     for title, env in worlds.items():
-        obs, _ = env.reset(seed=seed)
+        obs, _ = env.reset(seed=0)
         data, frames, total, ended = mujoco.MjData(env.model), [], 0.0, False
-        for step in range(max_steps):
-            if step % every == 0:
+        for step in range(MOST):
+            if step % EVERY == 0:
                 if not ended:
                     data.qpos[:] = env.qpos[0]
                     mujoco.mj_kinematics(env.model, data)
@@ -294,6 +298,6 @@ def animate(policy, worlds, path, seed=0, max_steps=500, every=4):
         frames.append(frame.quantize(64))
     env = next(iter(worlds.values()))
     gif = io.BytesIO()
-    frames[0].save(gif, "GIF", save_all=True, append_images=frames[1:], loop=0, duration=max(20, int(1000 * env.dt * every)))
+    frames[0].save(gif, "GIF", save_all=True, append_images=frames[1:], loop=0, duration=max(20, int(1000 * env.dt * EVERY)))
     write_whole(path, gif.getvalue())
     return returns

@@ -10,12 +10,12 @@ import numpy as np
 HORIZON = 0.3  # s
 
 
-def windows(time, horizon=HORIZON):
+def windows(time):
     """[(first row, last row)] of consecutive windows; one ends where the next begins; a stump is dropped."""
     found, first = [], 0
     while True:
-        last = int(np.searchsorted(time, time[first] + horizon * (1 + 1e-9), side="right")) - 1
-        if last <= first or last == len(time) - 1 and time[last] < time[first] + 0.9 * horizon:
+        last = int(np.searchsorted(time, time[first] + HORIZON * (1 + 1e-9), side="right")) - 1
+        if last <= first or last == len(time) - 1 and time[last] < time[first] + 0.9 * HORIZON:
             return found
         found.append((first, last))
         first = last
