@@ -165,7 +165,7 @@ def test_predict_all_goes_through_a_ragged_number_of_rows():
 
 def test_no_grounding_is_the_raw_sim():
     grounding = Grounding(world("Hopper-v4"))
-    assert grounding.transformer is identity and grounding.fit(None, None, 0) == grounding.update(None, 10, 0) == {}
+    assert grounding.transformer is identity and grounding.fit(None, 0) == grounding.update(None, 10, 0) == {}
 
 
 def test_ane_adds_noise_of_the_asked_width_to_actions():

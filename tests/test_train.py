@@ -309,7 +309,7 @@ def test_a_disk_that_fills_up_leaves_whole_steps(write, tmp_path, capfd, finishe
     folder, full = tmp_path / "run", OSError(errno.ENOSPC, "No space left on device")
     with monkeypatch.context() as patch:
         cut_off_at(patch, runs.os, "replace", write, full)
-        refused(command(folder), capfd, "No space left", "--out")
+        refused(command(folder), capfd, "No space left", "choose another folder")
     assert not list(folder.glob(".*"))
     assert train.main(["--resume", str(folder)]) == 0
     assert_same_run(folder, finished("rgat"))
