@@ -9,6 +9,7 @@ import html
 import io
 import json
 
+import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -134,7 +135,8 @@ def confusion(rows):
 
 def _picture(figure):
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", bbox_inches="tight")
+    with matplotlib.rc_context({"svg.hashsalt": "proof"}):  # the same table gives the same page
+        figure.savefig(buffer, format="svg", bbox_inches="tight", metadata={"Date": None})
     return f'<img src="data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode()}" alt="">'
 
 
