@@ -18,7 +18,7 @@ import numpy as np
 from hidden import Real
 from mechanisms import MECHANISMS, UNKNOWNS
 
-FINAL_SEED = 314159             # of the table to publish next: run once, while the method stands still
+FINAL_SEED = 314159             # of the published table: run once, while the method stood still
 SIZES = (0.03, 0.1, 0.3)
 NOISES = (0.0003, 0.001)                             # rad or m per reading
 BLOCK = ("null",) * 13 + ("single",) * 24 + ("pair",) * 8 + ("unknown",) * 5

@@ -287,6 +287,9 @@ def main():
         for path in (arguments.table, f"{arguments.table}.sealed"):
             if not os.path.isfile(path) or not os.path.getsize(path):
                 parser.error(f"{path}: no such file, or empty; name a table that `prove.py run` made, with its seals beside it")
+        rows = read(arguments.table)
+        if not rows:
+            parser.error(f"{arguments.table}: no trials in it; name a table that `prove.py run` made")
     if arguments.command == "run":
         run(arguments.seed, range(arguments.first, arguments.trials), arguments.out, arguments.jobs)
     elif arguments.command == "show":
@@ -296,9 +299,9 @@ def main():
         print(f"cd {folder} && python {ROOT / 'diagnose.py'}", *trial.command, "--out report\n" + trial.answer)
     elif arguments.command == "score":
         with ProcessPoolExecutor(cores()) as pool:
-            write(arguments.table, list(tqdm(pool.map(again, read(arguments.table)), disable=not sys.stderr.isatty())))
+            write(arguments.table, list(tqdm(pool.map(again, rows), disable=not sys.stderr.isatty())))
     else:
-        rows, seals = read(arguments.table), published(arguments.table)
+        seals = published(arguments.table)
         proof_page.write(rows, seals, arguments.out)
         for line in proof_page.lines([proof_page.parse(row, seals) for row in rows]):
             print("{:100s} {:>9s} {:>8s}  {}".format(*line))

@@ -418,11 +418,12 @@ def test_a_table_that_is_not_there_or_empty_is_named_and_none_is_made(command, t
     table = tmp_path / "proof.csv"
     if there is not None:
         table.write_text(there)
+        (tmp_path / "proof.csv.sealed").write_text("1 0 ab\n")
     monkeypatch.setattr(sys, "argv", ["prove.py", command, str(table), *(["--out", str(tmp_path / "page.html")] if command == "page" else [])])
     with pytest.raises(SystemExit) as leave:
         prove.main()
     assert leave.value.code == 2 and str(table) in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == ["proof.csv"] * (there is not None)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["proof.csv", "proof.csv.sealed"] * (there is not None)
 
 
 def test_a_fault_in_one_trial_leaves_the_others_for_later(tmp_path, monkeypatch):
