@@ -56,7 +56,10 @@ class Task:
 
     def observe(self, qpos, qvel):
         """Observations (N, nobs) of states (N, nq), (N, nv), as gymnasium's _get_obs."""
-        return np.concatenate((qpos[:, self.skip_root_x :], np.clip(qvel, -self.clip_velocity, self.clip_velocity)), axis=1)
+        return np.concatenate(
+            (qpos[:, self.skip_root_x :], np.clip(qvel, -self.clip_velocity, self.clip_velocity)),
+            axis=1,
+        )
 
 
 class InvertedPendulum(Task):
@@ -74,10 +77,26 @@ class Hopper(Task):
 
 TASKS = {
     "InvertedPendulum": InvertedPendulum(
-        "inverted_pendulum.xml", 2, 0.01, "pole:mass=100", skip_root_x=False, forward_weight=0.0, healthy_reward=1.0
+        "inverted_pendulum.xml",
+        2,
+        0.01,
+        "pole:mass=100",
+        skip_root_x=False,
+        forward_weight=0.0,
+        healthy_reward=1.0,
     ),
-    "Hopper": Hopper("hopper.xml", 4, 5e-3, "torso:mass*1.27", clip_velocity=10.0, ctrl_weight=1e-3, healthy_reward=1.0),
-    "HalfCheetah": Task("half_cheetah.xml", 5, 0.1, "torso:mass*1.15", normal_qvel=True, ctrl_weight=0.1),
+    "Hopper": Hopper(
+        "hopper.xml",
+        4,
+        5e-3,
+        "torso:mass*1.27",
+        clip_velocity=10.0,
+        ctrl_weight=1e-3,
+        healthy_reward=1.0,
+    ),
+    "HalfCheetah": Task(
+        "half_cheetah.xml", 5, 0.1, "torso:mass*1.15", normal_qvel=True, ctrl_weight=0.1
+    ),
 }
 ENV_IDS = [f"{name}-{version}" for name in TASKS for version in ("v4", "v5")]
 TIME_LIMIT = 1000  # steps, as registered in gymnasium for all three
@@ -97,7 +116,11 @@ def model_path(env_id):
 
 # --- the "real" world: the sim with named changes ---------------------------------------------------
 
-JOINT_FIELDS = {"damping": "dof_damping", "frictionloss": "dof_frictionloss", "armature": "dof_armature"}
+JOINT_FIELDS = {
+    "damping": "dof_damping",
+    "frictionloss": "dof_frictionloss",
+    "armature": "dof_armature",
+}
 FIELDS = ("mass", *JOINT_FIELDS, "gain", "gravity")
 
 
@@ -114,12 +137,14 @@ class Change:
         """The new value for an old one, floats. Raises EnvError where it is none."""
         new = self.value if self.op == "=" else float(old) * self.value
         if not np.isfinite(new):
-            raise EnvError(f"{self.name}:{self.field}*{self.value:g} makes {new} of {old:g}: choose a smaller factor")
+            raise EnvError(
+                f"{self.name}:{self.field}*{self.value:g} makes {new} of {old:g}: choose a smaller factor"
+            )
         return new
 
 
 def parse_perturbation(text):
-    """"torso:mass*1.27,foot_joint:frictionloss=0.5" -> list of Change. Raises EnvError if it does not parse.
+    """ "torso:mass*1.27,foot_joint:frictionloss=0.5" -> list of Change. Raises EnvError if it does not parse.
 
     Fields: mass (of a body), damping, frictionloss, armature (of a joint), gain (of an actuator, or of the
     actuator on a named joint), gravity ("world:gravity*0.9": the downward acceleration). "" is no change.
@@ -134,9 +159,17 @@ def parse_perturbation(text):
             form = "NAME:FIELD=VALUE or NAME:FIELD*FACTOR, e.g. torso:mass*1.27"
             raise EnvError(f"cannot read {part!r}: write {form}") from None
         if field not in FIELDS:
-            raise EnvError(f"unknown field {field!r} in {part!r}: choose one of {', '.join(FIELDS)}")
-        if not np.isfinite(value) or (field == "mass" and value <= 0) or (field in JOINT_FIELDS and value < 0):
-            raise EnvError(f"{part!r}: {value:g} is no possible {field}: give a finite{' positive' * (field == 'mass')} number")
+            raise EnvError(
+                f"unknown field {field!r} in {part!r}: choose one of {', '.join(FIELDS)}"
+            )
+        if (
+            not np.isfinite(value)
+            or (field == "mass" and value <= 0)
+            or (field in JOINT_FIELDS and value < 0)
+        ):
+            raise EnvError(
+                f"{part!r}: {value:g} is no possible {field}: give a finite{' positive' * (field == 'mass')} number"
+            )
         changes.append(Change(name.strip(), field, op, value))
     return changes
 
@@ -166,14 +199,20 @@ def perturb(model, changes):
             model.body_mass[body] = change.of(old)
         elif change.field == "gravity":
             if change.name != "world":
-                raise EnvError(f"gravity belongs to the world: write world:gravity{change.op}{change.value:g}")
+                raise EnvError(
+                    f"gravity belongs to the world: write world:gravity{change.op}{change.value:g}"
+                )
             # acceleration is positive downwards here, so that "=9.81" is the Earth's
             model.opt.gravity[2] = -change.of(-model.opt.gravity[2])
         elif change.field == "gain":
             joints = [model.joint(j).name for j in model.actuator_trnid[:, 0]]
-            actuators = [i for i in range(model.nu) if change.name in (model.actuator(i).name, joints[i])]
+            actuators = [
+                i for i in range(model.nu) if change.name in (model.actuator(i).name, joints[i])
+            ]
             if not actuators:
-                raise EnvError(f"no actuator {change.name!r} for its gain: name its joint, one of {', '.join(joints)}")
+                raise EnvError(
+                    f"no actuator {change.name!r} for its gain: name its joint, one of {', '.join(joints)}"
+                )
             for i in actuators:
                 model.actuator_gainprm[i, 0] = change.of(model.actuator_gainprm[i, 0])
         else:
@@ -216,7 +255,9 @@ class BatchEnv(VectorEnv):
         if perturbation:
             perturb(self.model, perturbation)
         self.dt = nominal.opt.timestep * self.task.frame_skip
-        self.frame_skip = max(1, round(self.dt / self.model.opt.timestep))  # a given model may take finer steps
+        self.frame_skip = max(
+            1, round(self.dt / self.model.opt.timestep)
+        )  # a given model may take finer steps
         # v4 pays for the step that falls, v5 does not
         self._pays_on_end = env_id.endswith("v4")
 
@@ -242,7 +283,9 @@ class BatchEnv(VectorEnv):
     def reset(self, *, seed=None, options=None):
         """Start every environment anew; environment i draws from seed + i. Returns (obs, {})."""
         if seed is not None or self._rng[0] is None:
-            seeds = [None] * self.num_envs if seed is None else [seed + i for i in range(self.num_envs)]
+            seeds = (
+                [None] * self.num_envs if seed is None else [seed + i for i in range(self.num_envs)]
+            )
             self._rng = [seeding.np_random(s)[0] for s in seeds]
         self._restart(np.arange(self.num_envs))
         self.obs = self.observe()
@@ -274,7 +317,9 @@ class BatchEnv(VectorEnv):
         """
         actions = np.asarray(actions)
         if actions.shape != self.action_space.shape:
-            raise EnvError(f"actions have shape {actions.shape}: {self.env_id} takes {self.action_space.shape}")
+            raise EnvError(
+                f"actions have shape {actions.shape}: {self.env_id} takes {self.action_space.shape}"
+            )
         x_before = self.qpos[:, 0].copy()
         self._ctrl[:] = actions if applied is None else applied
         self.batch.step(nstep=self.frame_skip)
@@ -331,7 +376,9 @@ class BatchEnv(VectorEnv):
         if task.forward_weight:
             reward += task.forward_weight * x_velocity
         if task.healthy_reward:
-            reward += task.healthy_reward if self._pays_on_end else task.healthy_reward * ~terminated
+            reward += (
+                task.healthy_reward if self._pays_on_end else task.healthy_reward * ~terminated
+            )
         if task.ctrl_weight:
             reward -= task.ctrl_weight * np.square(actions).sum(axis=1)
         return reward
@@ -342,7 +389,15 @@ class BatchEnv(VectorEnv):
             return
         # columns: last offending index, how often; a NaN control counts as unstable too
         kinds = mujoco.mjtWarning
-        fatal = [int(w) for w in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC, kinds.mjWARN_BADCTRL)]
+        fatal = [
+            int(w)
+            for w in (
+                kinds.mjWARN_BADQPOS,
+                kinds.mjWARN_BADQVEL,
+                kinds.mjWARN_BADQACC,
+                kinds.mjWARN_BADCTRL,
+            )
+        ]
         unstable = np.flatnonzero(batch.warning[:, fatal, 1].any(axis=1))
         if unstable.size:
             raise EnvError(

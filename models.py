@@ -53,7 +53,9 @@ class MLP(nn.Sequential):
         for k, layer in reversed(list(enumerate(self.linear))):
             found = [g.t() @ values[k], g.sum(0), *found]
             if k:
-                g = torch.ops.aten.tanh_backward(g @ layer.weight, values[k])  # (1 - h^2) times what arrives there
+                g = torch.ops.aten.tanh_backward(
+                    g @ layer.weight, values[k]
+                )  # (1 - h^2) times what arrives there
         return found
 
     @torch.no_grad()
@@ -110,7 +112,9 @@ class Normalizer(nn.Module):
         total = self.count + n
         weight = float(n / total)
         delta = x.mean(0) - self.mean
-        self.var.mul_(1 - weight).add_(weight * x.var(0, unbiased=False) + weight * (1 - weight) * delta**2)
+        self.var.mul_(1 - weight).add_(
+            weight * x.var(0, unbiased=False) + weight * (1 - weight) * delta**2
+        )
         if self.count == 0:
             self.var.copy_(x.var(0, unbiased=False))
         self.mean.add_(weight * delta)
@@ -145,7 +149,12 @@ class GaussianPolicy(nn.Module):
     @torch.no_grad()
     def sampler(self, generator=None):
         """act() of the policy as it now is: in a rollout, what depends on its weights alone is worked out once."""
-        center, std, clip, sigma = self.normalizer.mean, self.normalizer.std, self.normalizer.clip, self.log_std.exp()
+        center, std, clip, sigma = (
+            self.normalizer.mean,
+            self.normalizer.std,
+            self.normalizer.clip,
+            self.log_std.exp(),
+        )
         *hidden, (bias, weight) = [(layer.bias, layer.weight.t()) for layer in self.net.linear]
 
         @torch.no_grad()
@@ -171,7 +180,9 @@ class GaussianPolicy(nn.Module):
             policy = cls(sizes[0], sizes[-1], tuple(sizes[1:-1]))
             policy.load_state_dict(saved["state"])
         except (KeyError, TypeError, IndexError, RuntimeError) as error:
-            raise ValueError(f"no policy in this checkpoint ({str(error).splitlines()[0]})") from None
+            raise ValueError(
+                f"no policy in this checkpoint ({str(error).splitlines()[0]})"
+            ) from None
         return policy
 
 
@@ -182,7 +193,9 @@ def load_checkpoint(path):
     except FileNotFoundError:
         raise ValueError(f"{path}: no such checkpoint") from None
     except Exception as error:  # torch raises a dozen types for damaged files
-        raise ValueError(f"{path}: not a checkpoint of this program, or a damaged one ({type(error).__name__})") from None
+        raise ValueError(
+            f"{path}: not a checkpoint of this program, or a damaged one ({type(error).__name__})"
+        ) from None
 
 
 def gaussian_log_prob(mean, log_std, action):
@@ -253,12 +266,18 @@ class Regressor(nn.Module):
                 error = float(((self.net(x[held]) - target[held]) ** 2).mean())
             stale += 1
             if error < best:
-                best, best_state, stale = error, {k: v.clone() for k, v in self.net.state_dict().items()}, 0
+                best, best_state, stale = (
+                    error,
+                    {k: v.clone() for k, v in self.net.state_dict().items()},
+                    0,
+                )
             if stale >= patience:
                 break
         self.net.load_state_dict(best_state)
         with torch.no_grad():
-            return (((self.outputs.std * (self.net(x[held]) - target[held])) ** 2).mean(0).sqrt()).numpy()
+            return (
+                ((self.outputs.std * (self.net(x[held]) - target[held])) ** 2).mean(0).sqrt()
+            ).numpy()
 
 
 class ForwardModel(Regressor):

@@ -51,18 +51,29 @@ class RealModel:
 
     def __init__(self, sim, residual):
         self.sim, self.residual = sim, residual
-        self.net = ForwardModel(sim.single_observation_space.shape[0], sim.single_action_space.shape[0])
+        self.net = ForwardModel(
+            sim.single_observation_space.shape[0], sim.single_action_space.shape[0]
+        )
 
     def fit(self, tau_real, seed):
         """Fit to real Transitions, the sim started in each of their states. Returns the held-out RMS error by dimension."""
         torch.manual_seed(seed)
-        self.net = ForwardModel(*(space.shape[0] for space in (self.sim.single_observation_space, self.sim.single_action_space)))
+        self.net = ForwardModel(
+            *(
+                space.shape[0]
+                for space in (self.sim.single_observation_space, self.sim.single_action_space)
+            )
+        )
         seen = tau_real if not self.residual else tau_real[measured(self.sim, tau_real.s)]
         if len(seen) < 2:
-            raise EnvError(f"{len(seen)} usable real transitions are too few to fit a model on: raise --real-trajectories")
+            raise EnvError(
+                f"{len(seen)} usable real transitions are too few to fit a model on: raise --real-trajectories"
+            )
         guess = predict_all(self.sim, seen) if self.residual else seen.s
         s, a, s_next = seen.tensors()
-        return self.net.fit(s, a, s_next, torch.from_numpy(guess), torch.Generator().manual_seed(seed))
+        return self.net.fit(
+            s, a, s_next, torch.from_numpy(guess), torch.Generator().manual_seed(seed)
+        )
 
     @torch.no_grad()
     def __call__(self, s, a):
@@ -71,7 +82,11 @@ class RealModel:
         guess = self.sim.peek(a).astype(np.float32) if self.residual else s
         predicted = self.net(*(torch.from_numpy(x) for x in (s, a, guess))).numpy()
         # a state that the observation does not show in full was never fitted: there the sim's word stands
-        return (np.where(measured(self.sim, s)[:, None], predicted, guess) if self.residual else predicted), guess
+        return (
+            np.where(measured(self.sim, s)[:, None], predicted, guess)
+            if self.residual
+            else predicted
+        ), guess
 
 
 def measured(sim, s):
@@ -123,7 +138,13 @@ class ActionTransformerEnv(VectorEnv):
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, sim, transformer, policy, real_model, scale, seed):
-        self.sim, self.transformer, self.policy, self.real_model, self.scale = sim, transformer, policy, real_model, scale
+        self.sim, self.transformer, self.policy, self.real_model, self.scale = (
+            sim,
+            transformer,
+            policy,
+            real_model,
+            scale,
+        )
         self.num_envs = sim.num_envs
         nobs, nact = sim.single_observation_space.shape[0], sim.single_action_space.shape[0]
         self.single_observation_space = Box(-np.inf, np.inf, (nobs + nact,), np.float32)
@@ -146,8 +167,12 @@ class ActionTransformerEnv(VectorEnv):
         s, a = np.split(self.sa, [self.sim.single_observation_space.shape[0]], axis=1)
         predicted, guess = self.real_model(s, a)
         distance = lambda s_next: (((predicted - s_next) / self.scale) ** 2).sum(axis=1)
-        obs, _, terminated, truncated, info = self.sim.step(a, applied=self.transformer.apply(a, output))
-        reward = -distance(info["next_obs"]) + (distance(guess) if self.real_model.residual else 0.0)
+        obs, _, terminated, truncated, info = self.sim.step(
+            a, applied=self.transformer.apply(a, output)
+        )
+        reward = -distance(info["next_obs"]) + (
+            distance(guess) if self.real_model.residual else 0.0
+        )
         next_sa = self._with_action(info["next_obs"])
         done = terminated | truncated
         self.sa = next_sa.copy()
@@ -168,7 +193,9 @@ class GroundingSettings:
     residual: bool = True  # rgat and gat: f_psi corrects the sim's own prediction
     per_step: bool = True  # rgat and oracle: R_AT in units of each dimension's change in a real step, not as it stands
     smoothing: float = 0.95  # gat: a_hat = smoothing * g(s, a) + (1 - smoothing) * a
-    ane_width: float = 0.2  # ane: standard deviation of the action noise, in units of half the action range
+    ane_width: float = (
+        0.2  # ane: standard deviation of the action noise, in units of half the action range
+    )
 
 
 class Grounding:
@@ -180,7 +207,10 @@ class Grounding:
     def __init__(self, sim, settings=GroundingSettings()):
         self.sim, self.settings = sim, settings
         self.low, self.high = sim.single_action_space.low, sim.single_action_space.high
-        self.nobs, self.nact = sim.single_observation_space.shape[0], sim.single_action_space.shape[0]
+        self.nobs, self.nact = (
+            sim.single_observation_space.shape[0],
+            sim.single_action_space.shape[0],
+        )
         self.transformer = identity
         self.scale = np.ones(self.nobs, np.float32)
 
@@ -232,20 +262,33 @@ class RGAT(Grounding):
         # exploration is renewed: with what TRPO leaves of it, a trust region would hold g_phi where it is
         with torch.no_grad():
             self.learner.policy.log_std.fill_(np.log(self.settings.at_std))
-        env = ActionTransformerEnv(self.sim, self.transformer, policy, self.real_model, self.scale, seed)
+        env = ActionTransformerEnv(
+            self.sim, self.transformer, policy, self.real_model, self.scale, seed
+        )
         kls = []
-        self.learner.learn(env, steps, seed, on_update=lambda stats: (kls.append(stats["kl"]), on_update and on_update(stats)))
+        self.learner.learn(
+            env,
+            steps,
+            seed,
+            on_update=lambda stats: (kls.append(stats["kl"]), on_update and on_update(stats)),
+        )
         std = self.learner.policy.log_std.detach().exp().numpy() * (self.high - self.low)
         return {"at_std": float(std.mean()), "kl": float(np.mean(kls))}
 
     def _new_transformer(self):
-        policy = GaussianPolicy(self.nobs + self.nact, self.nact, log_std=np.log(self.settings.at_std))
+        policy = GaussianPolicy(
+            self.nobs + self.nact, self.nact, log_std=np.log(self.settings.at_std)
+        )
         self.learner = TRPO(policy, Value(self.nobs + self.nact), self.settings.at)
         self.transformer = ActionTransformer(policy, self.low, self.high)
 
     def state(self):
         scale = torch.from_numpy(self.scale)
-        return {"at": self.learner.state(), "forward_model": self.real_model.net.state_dict(), "scale": scale}
+        return {
+            "at": self.learner.state(),
+            "forward_model": self.real_model.net.state_dict(),
+            "scale": scale,
+        }
 
     def load(self, state):
         self.learner.load(state["at"])
@@ -272,7 +315,10 @@ class GAT(Grounding):
         episodes, tau_sim = 0, None
         while tau_sim is None or len(tau_sim) < min(steps, len(self.seen)):
             more = rollouts(policy, self.sim, self.sim.num_envs, seed + episodes)[1]
-            tau_sim, episodes = more if tau_sim is None else tau_sim + more, episodes + self.sim.num_envs
+            tau_sim, episodes = (
+                more if tau_sim is None else tau_sim + more,
+                episodes + self.sim.num_envs,
+            )
         s, a, s_next = tau_sim.tensors()
         torch.manual_seed(seed)
         self.inverse_model = InverseModel(self.nobs, self.nact)
@@ -288,7 +334,10 @@ class GAT(Grounding):
         return np.clip(smoothing * a_hat + (1 - smoothing) * action, self.low, self.high)
 
     def state(self):
-        return {"inverse_model": self.inverse_model.state_dict(), "forward_model": self.real_model.net.state_dict()}
+        return {
+            "inverse_model": self.inverse_model.state_dict(),
+            "forward_model": self.real_model.net.state_dict(),
+        }
 
     def load(self, state):
         self.inverse_model.load_state_dict(state["inverse_model"])
@@ -353,19 +402,30 @@ class Oracle(Grounding):
         target = self._after(self.real_batch, action[:, None])
         # probe towards the middle, so that no probe leaves the actuator's range
         reach = self.epsilon * span * np.where(action > (self.high + self.low) / 2, -1.0, 1.0)
-        probes = np.concatenate((action[:, None], action[:, None] + reach[:, None] * np.eye(self.nact)), axis=1)
+        probes = np.concatenate(
+            (action[:, None], action[:, None] + reach[:, None] * np.eye(self.nact)), axis=1
+        )
         after = self._after(self.probe, probes)
         residual = target - after[:, :1]
         jacobian = (after[:, 1:] - after[:, :1]) / reach[..., None]
         normal = np.einsum("naj,nbj->nab", jacobian, jacobian) + 1e-9 * np.eye(self.nact)
-        step = np.linalg.solve(normal, np.einsum("naj,nj->na", jacobian, residual[:, 0])[..., None])[..., 0]
+        step = np.linalg.solve(
+            normal, np.einsum("naj,nj->na", jacobian, residual[:, 0])[..., None]
+        )[..., 0]
         trials = np.clip(action[:, None] + np.stack((step, step / 2), axis=1), self.low, self.high)
         errors = np.concatenate((residual, target - self._after(self.trial, trials)), axis=1)
         choices = np.concatenate((action[:, None], trials), axis=1)
         return choices[np.arange(len(action)), (errors**2).sum(axis=2).argmin(axis=1)]
 
 
-METHODS = {"rgat": RGAT, "gat": GAT, "ane": ANE, "oracle": Oracle, "sim": Grounding, "real": Grounding}
+METHODS = {
+    "rgat": RGAT,
+    "gat": GAT,
+    "ane": ANE,
+    "oracle": Oracle,
+    "sim": Grounding,
+    "real": Grounding,
+}
 
 
 def step_size(transitions):
@@ -388,10 +448,16 @@ def one_step_error(env, transformer, transitions, limit=4096):
     rows = rows[np.linspace(0, len(rows) - 1, min(limit, len(rows))).astype(int)]
     miss, change = [], []
     for part in np.array_split(rows, -(-len(rows) // env.num_envs)):
-        fill = np.resize(part, env.num_envs)  # a batch has one size: repeat rows, then drop the repeats
-        s, a, s_next = (x[fill].astype(float) for x in (transitions.s, transitions.a, transitions.s_next))
+        fill = np.resize(
+            part, env.num_envs
+        )  # a batch has one size: repeat rows, then drop the repeats
+        s, a, s_next = (
+            x[fill].astype(float) for x in (transitions.s, transitions.a, transitions.s_next)
+        )
         a_hat = []
         after = env.predict(s, lambda obs: a_hat.append(transformer(obs, a)) or a_hat[0])
         miss.append((after - s_next)[: len(part)] ** 2)
         change.append(((a_hat[0] - a) ** 2).sum(axis=1)[: len(part)])
-    return relative(np.sqrt(np.concatenate(miss).mean(axis=0)), transitions[rows]), float(np.sqrt(np.concatenate(change).mean()))
+    return relative(np.sqrt(np.concatenate(miss).mean(axis=0)), transitions[rows]), float(
+        np.sqrt(np.concatenate(change).mean())
+    )

@@ -1,15 +1,15 @@
 """Train a policy in simulation that works on the "real" robot: Algorithm 1 of the RGAT paper, and its rivals.
 
-    python train.py --env Hopper-v4 --algo rgat
-    python train.py --env InvertedPendulum-v4 --algo gat --seed 3 --out runs/pendulum
-    python train.py --resume runs/pendulum
-    python train.py --replay runs/pendulum
+python train.py --env Hopper-v4 --algo rgat
+python train.py --env InvertedPendulum-v4 --algo gat --seed 3 --out runs/pendulum
+python train.py --resume runs/pendulum
+python train.py --replay runs/pendulum
 """
 
 import argparse
+import dataclasses
 import hashlib
 import json
-import dataclasses
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,27 +18,45 @@ import mujoco
 import numpy as np
 import torch
 
+from diagnosis.common.atomic_files import WriteError, write_whole
+from diagnosis.common.mujoco_warnings import quiet
 from envs import BatchEnv, EnvError, model_path, parse_perturbation, perturb, task_of
-from files import WriteError, write_whole
 from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint
 from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, identity, one_step_error
-from remodel import Physics
-from runs import Bar, Run, RunError, animate, save_whole, versions
+from training.physics_grounding import Physics
+from training.run_folder import Bar, Run, RunError, animate, save_whole, versions
 from trpo import PRESETS, TRPO, Transitions, rollouts
-from world import quiet
 
 # settings that suit each task, where the command line does not say
-LARGE = dict(pretrain_steps=1_000_000, reference_steps=1_000_000, at_steps=200_000, policy_steps=250_000, at_std=0.01)
+LARGE = dict(
+    pretrain_steps=1_000_000,
+    reference_steps=1_000_000,
+    at_steps=200_000,
+    policy_steps=250_000,
+    at_std=0.01,
+)
 DEFAULTS = {
     "InvertedPendulum": dict(
-        grounding_steps=5, pretrain_steps=80_000, reference_steps=200_000, at_steps=50_000, policy_steps=20_000, at_std=0.05
+        grounding_steps=5,
+        pretrain_steps=80_000,
+        reference_steps=200_000,
+        at_steps=50_000,
+        policy_steps=20_000,
+        at_std=0.05,
     ),
     "Hopper": dict(grounding_steps=10, **LARGE),
     "HalfCheetah": dict(grounding_steps=20, **LARGE),
 }
 
 
-UNSOUND = AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError  # what a checkpoint of something else raises
+UNSOUND = (
+    AttributeError,
+    IndexError,
+    KeyError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)  # what a checkpoint of something else raises
 
 
 def option(default, help, **extra):
@@ -56,54 +74,93 @@ class Settings:
         choices=[*METHODS, "physics"],
     )
     seed: int = option(0, "seed of everything random")
-    real: str = option(None, "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)")
-    policy: str = option("deep", "hidden layers of the target policy: deep 2x64, shallow 1x4", choices=["deep", "shallow"])
-    pretrain_steps: int = option(None, "steps in the raw sim before the first grounding step (default: by task)")
+    real: str = option(
+        None,
+        "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)",
+    )
+    policy: str = option(
+        "deep",
+        "hidden layers of the target policy: deep 2x64, shallow 1x4",
+        choices=["deep", "shallow"],
+    )
+    pretrain_steps: int = option(
+        None, "steps in the raw sim before the first grounding step (default: by task)"
+    )
     reference_steps: int = option(
-        None, "steps on real, from scratch, of the policy that is the reference line (default: by task, or --pretrain-steps if given)"
+        None,
+        "steps on real, from scratch, of the policy that is the reference line (default: by task, or --pretrain-steps if given)",
     )
     grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
     real_trajectories: int = option(
-        None, "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)"
+        None,
+        "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)",
     )
-    at_steps: int = option(None, "sim steps per grounding step for the action transformer (default: by task)")
-    policy_steps: int = option(None, "grounded-sim steps per grounding step for the policy (default: by task)")
-    eval_episodes: int = option(20, "real episodes per evaluation, deterministic and again stochastic")
+    at_steps: int = option(
+        None, "sim steps per grounding step for the action transformer (default: by task)"
+    )
+    policy_steps: int = option(
+        None, "grounded-sim steps per grounding step for the policy (default: by task)"
+    )
+    eval_episodes: int = option(
+        20, "real episodes per evaluation, deterministic and again stochastic"
+    )
     num_envs: int = option(32, "simulations stepped at once")
     at_max_kl: float = option(AT_CONFIG.max_kl, "rgat: trust region of the action transformer")
     at_gamma: float = option(AT_CONFIG.gamma, "rgat: discount of the action transformer")
-    at_entropy: float = option(AT_CONFIG.entropy, "rgat: entropy coefficient of the action transformer")
-    at_std: float = option(None, "rgat: its initial standard deviation, as a part of the action range (default: by task)")
+    at_entropy: float = option(
+        AT_CONFIG.entropy, "rgat: entropy coefficient of the action transformer"
+    )
+    at_std: float = option(
+        None,
+        "rgat: its initial standard deviation, as a part of the action range (default: by task)",
+    )
     forward_model: str = option(
         "residual",
         "rgat, gat: f_psi corrects the sim's own prediction, or (plain) is the paper's network of (s, a) alone",
         choices=["residual", "plain"],
     )
-    threads: int = option(0, "cores that this run may take (default: all); seeds side by side do best with 1 each")
-    pretrained: str = option("", "folder that keeps policies trained from scratch, for other runs to share")
+    threads: int = option(
+        0, "cores that this run may take (default: all); seeds side by side do best with 1 each"
+    )
+    pretrained: str = option(
+        "", "folder that keeps policies trained from scratch, for other runs to share"
+    )
     ane_width: float = option(
-        GroundingSettings.ane_width, "ane: standard deviation of the action noise, as a part of half the action range"
+        GroundingSettings.ane_width,
+        "ane: standard deviation of the action noise, as a part of half the action range",
     )
 
     def completed(self):
         """These settings with the task's defaults filled in. Raises EnvError or RunError for impossible ones."""
         task = task_of(self.env)
         trajectories = 1 if self.algo == "physics" else 50
-        defaults = {**DEFAULTS[self.env.split("-")[0]], "real": task.real, "real_trajectories": trajectories}
+        defaults = {
+            **DEFAULTS[self.env.split("-")[0]],
+            "real": task.real,
+            "real_trajectories": trajectories,
+        }
         if self.pretrain_steps is not None:
             defaults["reference_steps"] = self.pretrain_steps
-        done = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
+        done = dataclasses.replace(
+            self, **{k: v for k, v in defaults.items() if getattr(self, k) is None}
+        )
         for name, least in COUNTS.items():
             if getattr(done, name) < least:
-                raise RunError(f"--{name.replace('_', '-')} is {getattr(done, name)}: it must be at least {least}")
+                raise RunError(
+                    f"--{name.replace('_', '-')} is {getattr(done, name)}: it must be at least {least}"
+                )
         for name in ("at_max_kl", "at_std"):
             if not 0 < getattr(done, name) < np.inf:
-                raise RunError(f"--{name.replace('_', '-')} is {getattr(done, name)}: it must be positive")
+                raise RunError(
+                    f"--{name.replace('_', '-')} is {getattr(done, name)}: it must be positive"
+                )
         if not 0 <= done.at_gamma < 1:
             raise RunError(f"--at-gamma is {done.at_gamma}: it must be at least 0 and below 1")
         if not 0 <= done.ane_width < np.inf or not 0 <= done.at_entropy < np.inf:
             raise RunError("--ane-width and --at-entropy must be 0 or more")
-        perturb(mujoco.MjModel.from_xml_path(str(model_path(done.env))), parse_perturbation(done.real))  # are the names the model's?
+        perturb(
+            mujoco.MjModel.from_xml_path(str(model_path(done.env))), parse_perturbation(done.real)
+        )  # are the names the model's?
         return done
 
 
@@ -115,8 +172,20 @@ COUNTS = {
 
 def seed_for(seed, step, purpose):
     """An independent seed for each use in each grounding step, so that a resumed run draws the same numbers."""
-    purposes = ("networks", "pretrain", "collect", "model", "transformer", "held out", "policy", "evaluate", "best")
-    return int(np.random.SeedSequence([seed, step, purposes.index(purpose)]).generate_state(1)[0] >> 1)
+    purposes = (
+        "networks",
+        "pretrain",
+        "collect",
+        "model",
+        "transformer",
+        "held out",
+        "policy",
+        "evaluate",
+        "best",
+    )
+    return int(
+        np.random.SeedSequence([seed, step, purposes.index(purpose)]).generate_state(1)[0] >> 1
+    )
 
 
 # --- Algorithm 1 --------------------------------------------------------------------------------------
@@ -131,15 +200,23 @@ def algorithm_1(s, run, bar):
     learner, grounding, tau_real = start(s, run, sim, real, bar)
     policy = learner.policy
 
-    for step in range(len(run.progress), s.grounding_steps + 1):  # 1: while the policy improves on real: here a fixed number of times
+    for step in range(
+        len(run.progress), s.grounding_steps + 1
+    ):  # 1: while the policy improves on real: here a fixed number of times
         seeds = lambda purpose: seed_for(s.seed, step, purpose)
         tau_new = collect(s, grounding, policy, real, seeds("collect"))  # 2: collect tau_real ...
         tau_real += tau_new  # ... and keep what was collected before
         stats = grounding.fit(tau_real, seeds("model"))  # 3: train f_psi with tau_real
-        stats |= update_transformer(s, grounding, policy, sim, real, seeds, bar.phase(step, "transformer"))  # 4: update g_phi by optimize1
+        stats |= update_transformer(
+            s, grounding, policy, sim, real, seeds, bar.phase(step, "transformer")
+        )  # 4: update g_phi by optimize1
         grounded_sim = GroundedEnv(grounding.sim, grounding.transformer)
-        learner.learn(grounded_sim, s.policy_steps, seeds("policy"), on_update=bar.phase(step, "policy"))  # 5: update pi_theta by optimize2
-        record(s, run, step, learner, grounding, real, tau_new, stats, bar)  # 6: end while; the run keeps the best policy
+        learner.learn(
+            grounded_sim, s.policy_steps, seeds("policy"), on_update=bar.phase(step, "policy")
+        )  # 5: update pi_theta by optimize2
+        record(
+            s, run, step, learner, grounding, real, tau_new, stats, bar
+        )  # 6: end while; the run keeps the best policy
 
 
 def collect(s, grounding, policy, real, seed):
@@ -154,7 +231,10 @@ def collect(s, grounding, policy, real, seed):
 
 def nothing(env):
     """Transitions of length 0."""
-    s, a = (np.empty((0, space.shape[0]), np.float32) for space in (env.single_observation_space, env.single_action_space))
+    s, a = (
+        np.empty((0, space.shape[0]), np.float32)
+        for space in (env.single_observation_space, env.single_action_space)
+    )
     return Transitions(s, a, s)
 
 
@@ -165,7 +245,12 @@ def update_transformer(s, grounding, policy, sim, real, seeds, log):
     held_out = rollouts(policy, real, s.eval_episodes, seeds("held out"))[1]
     error, change = one_step_error(grounding.sim, grounding.transformer, held_out)
     untouched = one_step_error(sim, identity, held_out)[0]
-    return {**stats, "at_one_step_error": error, "identity_one_step_error": untouched, "delta_action_rms": change}
+    return {
+        **stats,
+        "at_one_step_error": error,
+        "identity_one_step_error": untouched,
+        "delta_action_rms": change,
+    }
 
 
 def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
@@ -173,13 +258,16 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
     seed = seed_for(s.seed, step, "evaluate")
     deterministic = rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)[0]
     stochastic = rollouts(learner.policy, real, s.eval_episodes, seed)[0]
-    before = run.progress[-1] if run.progress else {"real_transitions": 0, "sim_steps": 0, "seconds": 0}
+    before = (
+        run.progress[-1] if run.progress else {"real_transitions": 0, "sim_steps": 0, "seconds": 0}
+    )
     steps, seconds = bar.lap()
     on_real = s.algo == "real"
     row = {
         "grounding_step": step,
         "real_transitions": int(before["real_transitions"]) + (steps if on_real else len(tau_new)),
-        "sim_steps": int(before["sim_steps"]) + (0 if on_real else steps + stats.get("sim_transitions", 0)),
+        "sim_steps": int(before["sim_steps"])
+        + (0 if on_real else steps + stats.get("sim_transitions", 0)),
         "real_return_deterministic": float(deterministic.mean()),
         "real_return_deterministic_se": standard_error(deterministic),
         "real_return_stochastic": float(stochastic.mean()),
@@ -187,8 +275,18 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
         "seconds": round(float(before["seconds"]) + seconds, 1),
     }
     transformer = grounding.state() if step else {}
-    run.record(row, {"learner": learner.state(), "grounding": transformer, "acting": learner.policy.checkpoint()}, tau_new)
-    bar.say(f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real")
+    run.record(
+        row,
+        {
+            "learner": learner.state(),
+            "grounding": transformer,
+            "acting": learner.policy.checkpoint(),
+        },
+        tau_new,
+    )
+    bar.say(
+        f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real"
+    )
 
 
 def standard_error(x):
@@ -205,7 +303,9 @@ def start(s, run, sim, real, bar):
     at = dataclasses.replace(AT_CONFIG, max_kl=s.at_max_kl, gamma=s.at_gamma, entropy=s.at_entropy)
     settings = GroundingSettings(at, s.at_std, s.forward_model == "residual", ane_width=s.ane_width)
     learner = new_learner(s)  # seeds torch for the grounding's networks too
-    grounding = method(world, settings, real.model) if s.algo == "oracle" else method(world, settings)
+    grounding = (
+        method(world, settings, real.model) if s.algo == "oracle" else method(world, settings)
+    )
     tau_real = nothing(real)
     done = len(run.progress) - 1
     if done >= 0:
@@ -215,7 +315,9 @@ def start(s, run, sim, real, bar):
             if done:
                 grounding.load(saved["grounding"])
         except UNSOUND:
-            raise RunError(f"{run.folder}/step_{done:02d}.pt does not belong to this run: start a new one") from None
+            raise RunError(
+                f"{run.folder}/step_{done:02d}.pt does not belong to this run: start a new one"
+            ) from None
         for step in range(1, done + 1):
             tau_real += Transitions(*run.real(step))
         bar.skip(int(run.progress[-1]["real_transitions" if s.algo == "real" else "sim_steps"]))
@@ -238,7 +340,13 @@ def reference(s, run, learner, real, bar):
         learner = new_learner(s)
         learner.load(pretrained(s, "real", real, s.reference_steps, bar))
     seed = seed_for(s.seed, 0, "evaluate")
-    run.set_lines(**{"trained on real": float(rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)[0].mean())})
+    run.set_lines(
+        **{
+            "trained on real": float(
+                rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)[0].mean()
+            )
+        }
+    )
 
 
 def new_learner(s):
@@ -253,7 +361,16 @@ def new_learner(s):
 def pretrained(s, world, env, steps, bar):
     """TRPO from scratch in a world, "sim" or "real": the learner's state. Runs that name one --pretrained folder share it."""
     preset = PRESETS[s.env.split("-")[0]]
-    decides = [s.env, s.real if world == "real" else "", s.policy, s.seed, steps, s.num_envs, preset, versions()]
+    decides = [
+        s.env,
+        s.real if world == "real" else "",
+        s.policy,
+        s.seed,
+        steps,
+        s.num_envs,
+        preset,
+        versions(),
+    ]
     key = hashlib.sha256(repr(decides).encode()).hexdigest()[:16]
     folder = Path(s.pretrained) if s.pretrained else bar.run.folder
     path = folder / f"{s.env}-{world}-{key}.pt"
@@ -269,11 +386,17 @@ def pretrained(s, world, env, steps, bar):
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunError(f"cannot make the folder {folder}: {error.strerror}; choose another --pretrained") from None
+        raise RunError(
+            f"cannot make the folder {folder}: {error.strerror}; choose another --pretrained"
+        ) from None
     name = "pretrain" if world == bar.world else "reference"
-    bar.run.train = [row for row in bar.run.train if row["phase"] != name]  # what a cut-off attempt left
+    bar.run.train = [
+        row for row in bar.run.train if row["phase"] != name
+    ]  # what a cut-off attempt left
     log = bar.phase(0, name)
-    learner.learn(env, steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=log)
+    learner.learn(
+        env, steps, seed_for(s.seed, 0, "pretrain"), freeze_normalizer=False, on_update=log
+    )
     bar.run.flush()
     save_whole(path, learner.state())
     return learner.state()
@@ -284,14 +407,26 @@ def pretrained(s, world, env, steps, bar):
 
 def verdict(s, run):
     """The best policy judged once more, on real episodes that did not choose it: best.json, and a line that says so."""
-    step = max(range(len(run.progress)), key=lambda k: float(run.progress[k]["real_return_deterministic"]))
+    step = max(
+        range(len(run.progress)), key=lambda k: float(run.progress[k]["real_return_deterministic"])
+    )
     policy = run.policy()
     real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=s.threads)
-    returns = rollouts(policy, real, 2 * s.eval_episodes, seed_for(s.seed, step, "best"), deterministic=True)[0]
-    best = {"grounding_step": step, "episodes": len(returns), "real_return_deterministic": float(returns.mean()), "se": standard_error(returns)}
+    returns = rollouts(
+        policy, real, 2 * s.eval_episodes, seed_for(s.seed, step, "best"), deterministic=True
+    )[0]
+    best = {
+        "grounding_step": step,
+        "episodes": len(returns),
+        "real_return_deterministic": float(returns.mean()),
+        "se": standard_error(returns),
+    }
     write_whole(run.folder / "best.json", json.dumps(best, indent=1))
     shown = f"{best['real_return_deterministic']:.0f} ± {best['se']:.0f} on {len(returns)} fresh episodes"
-    untouched, line = float(run.progress[0]["real_return_deterministic"]), run.lines["trained on real"]
+    untouched, line = (
+        float(run.progress[0]["real_return_deterministic"]),
+        run.lines["trained on real"],
+    )
     return f"{run.folder}: best on real after grounding step {step}: {shown} (before grounding {untouched:.0f}, trained on real {line:.0f})"
 
 
@@ -302,9 +437,14 @@ def replay(folder):
     policy = run.policy()
     worlds = {"sim": BatchEnv(s.env, 1), "real": BatchEnv(s.env, 1, parse_perturbation(s.real))}
     if policy.sizes[0] != worlds["sim"].single_observation_space.shape[0]:
-        raise RunError(f"{folder}/policy.pt was trained on another task than {s.env}: start a new run")
+        raise RunError(
+            f"{folder}/policy.pt was trained on another task than {s.env}: start a new run"
+        )
     returns = animate(policy, worlds, run.folder / "replay.gif")
-    print(f"{run.folder / 'replay.gif'}: " + ", ".join(f"{name} {value:.0f}" for name, value in returns.items()))
+    print(
+        f"{run.folder / 'replay.gif'}: "
+        + ", ".join(f"{name} {value:.0f}" for name, value in returns.items())
+    )
 
 
 def settings_of(folder, saved):
@@ -312,11 +452,17 @@ def settings_of(folder, saved):
     try:
         s = Settings(**saved).completed()
         values = [(f, getattr(s, f.name)) for f in dataclasses.fields(Settings)]
-        sound = all(type(v) in ((float, int) if kind_of(f) is float else (kind_of(f),)) and v in f.metadata.get("choices", [v]) for f, v in values)
+        sound = all(
+            type(v) in ((float, int) if kind_of(f) is float else (kind_of(f),))
+            and v in f.metadata.get("choices", [v])
+            for f, v in values
+        )
     except (TypeError, AttributeError):
         sound = False
     if not sound:
-        raise RunError(f"{folder}/config.json does not hold this program's settings: start a new run")
+        raise RunError(
+            f"{folder}/config.json does not hold this program's settings: start a new run"
+        )
     return s
 
 
@@ -332,18 +478,42 @@ class Parser(argparse.ArgumentParser):
 
 def parse(argv):
     """The parsed command line: every field of Settings, and what to do with which run. Raises RunError where it makes no sense."""
-    parser = Parser(prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(
+        prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for f in dataclasses.fields(Settings):
-        shown = "" if f.default in (None, "") or "(default:" in f.metadata["help"] else f" (default: {f.default})"
+        shown = (
+            ""
+            if f.default in (None, "") or "(default:" in f.metadata["help"]
+            else f" (default: {f.default})"
+        )
         extra = {k: v for k, v in f.metadata.items() if k != "help"}
-        parser.add_argument(f"--{f.name.replace('_', '-')}", type=kind_of(f), default=f.default, help=f.metadata["help"] + shown, **extra)
+        parser.add_argument(
+            f"--{f.name.replace('_', '-')}",
+            type=kind_of(f),
+            default=f.default,
+            help=f.metadata["help"] + shown,
+            **extra,
+        )
     parser.add_argument("--out", help="folder of the run (default: runs/ENV-ALGO-sSEED)")
-    parser.add_argument("--resume", metavar="RUN", help="continue the run in this folder, with the settings it began with")
-    parser.add_argument("--replay", metavar="RUN", help="animate the best policy of this run on sim and real, to RUN/replay.gif")
+    parser.add_argument(
+        "--resume",
+        metavar="RUN",
+        help="continue the run in this folder, with the settings it began with",
+    )
+    parser.add_argument(
+        "--replay",
+        metavar="RUN",
+        help="animate the best policy of this run on sim and real, to RUN/replay.gif",
+    )
     args = parser.parse_args(argv)
-    given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default] + ["out"] * (args.out is not None)
+    given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default] + [
+        "out"
+    ] * (args.out is not None)
     if given and (args.resume or args.replay):
-        raise RunError(f"--{given[0].replace('_', '-')} cannot be changed: a run goes on in its folder with the settings it began with; leave it out")
+        raise RunError(
+            f"--{given[0].replace('_', '-')} cannot be changed: a run goes on in its folder with the settings it began with; leave it out"
+        )
     if args.resume and args.replay:
         raise RunError("--resume and --replay are two things to do: give one of them")
     return args
@@ -361,7 +531,9 @@ def main(argv=None):
             run, saved = Run.open(args.resume)
             s = settings_of(args.resume, saved)
         else:
-            s = Settings(**{f.name: getattr(args, f.name) for f in dataclasses.fields(Settings)}).completed()
+            s = Settings(
+                **{f.name: getattr(args, f.name) for f in dataclasses.fields(Settings)}
+            ).completed()
             run = Run.create(args.out or f"runs/{s.env}-{s.algo}-s{s.seed}", dataclasses.asdict(s))
         with quiet():  # MuJoCo's own warnings: an unstable simulation is told below, in one line
             algorithm_1(s, run, Bar(s, run))
@@ -371,7 +543,10 @@ def main(argv=None):
         print(f"train.py: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"\nstopped; go on with: python train.py --resume {run.folder}" if run else "\nstopped", file=sys.stderr)
+        print(
+            f"\nstopped; go on with: python train.py --resume {run.folder}" if run else "\nstopped",
+            file=sys.stderr,
+        )
         return 130
 
 

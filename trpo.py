@@ -46,7 +46,9 @@ class TRPOConfig:
 PRESETS = {
     "InvertedPendulum": TRPOConfig(value_epochs=10),
     "Hopper": TRPOConfig(gamma=0.995, lam=0.97),  # at 0.99 and 0.95 some seeds never stop falling
-    "HalfCheetah": TRPOConfig(normalize_obs=True, max_kl=0.02),  # at 0.01 two of three seeds stay near 1600 for 1 M steps
+    "HalfCheetah": TRPOConfig(
+        normalize_obs=True, max_kl=0.02
+    ),  # at 0.01 two of three seeds stay near 1600 for 1 M steps
 }
 
 
@@ -78,7 +80,9 @@ def conjugate_gradient(product, b, steps, tolerance=1e-10):
             break
         Ap = product(p)
         pAp = p @ Ap
-        if not pAp > 0:  # rounding has eaten the curvature (or NaN): what we have is as good as it gets
+        if (
+            not pAp > 0
+        ):  # rounding has eaten the curvature (or NaN): what we have is as good as it gets
             break
         alpha = rr / pAp
         x = x + alpha * p
@@ -122,14 +126,18 @@ def policy_update(policy, obs, action, advantage, config):
     spread = advantage.std() if len(advantage) > 1 else torch.zeros(())
     # an advantage that is the same everywhere says nothing; dividing by its rounding error would
     informative = torch.isfinite(spread) and spread > 1e-9 * advantage.abs().max()
-    advantage = ((advantage - advantage.mean()) / spread if informative else torch.zeros_like(advantage)).to(obs.dtype)
+    advantage = (
+        (advantage - advantage.mean()) / spread if informative else torch.zeros_like(advantage)
+    ).to(obs.dtype)
 
     mean, log_std = policy(obs)
     log_prob = gaussian_log_prob(mean, log_std, action)
     old_mean, old_log_std, old_log_prob = mean.detach(), log_std.detach().clone(), log_prob.detach()
 
     def surrogate(log_prob, log_std):
-        return (torch.exp(log_prob - old_log_prob) * advantage).mean() + config.entropy * gaussian_entropy(log_std)
+        return (
+            torch.exp(log_prob - old_log_prob) * advantage
+        ).mean() + config.entropy * gaussian_entropy(log_std)
 
     stats = {"kl": 0.0, "surrogate_gain": 0.0, "step_size": 0.0, "line_search": "accepted"}
     old_surrogate = surrogate(log_prob, log_std)
@@ -137,7 +145,11 @@ def policy_update(policy, obs, action, advantage, config):
     old_surrogate = old_surrogate.detach()
     old = parameters_to_vector(policy.parameters()).detach().clone()
     if not torch.isfinite(gradient).all() or not gradient.any():
-        return {**stats, "line_search": "no gradient", "entropy": float(gaussian_entropy(old_log_std))}
+        return {
+            **stats,
+            "line_search": "no gradient",
+            "entropy": float(gaussian_entropy(old_log_std)),
+        }
 
     product = fisher_product(policy, obs[:: config.fisher_every], config.cg_damping)
     direction = conjugate_gradient(product, gradient, config.cg_steps)
@@ -151,9 +163,18 @@ def policy_update(policy, obs, action, advantage, config):
                 mean, log_std = policy(obs)
                 new_surrogate = surrogate(gaussian_log_prob(mean, log_std, action), log_std)
                 kl = gaussian_kl(old_mean, old_log_std, mean, log_std)
-                if torch.isfinite(new_surrogate) and kl <= config.max_kl and new_surrogate > old_surrogate:
+                if (
+                    torch.isfinite(new_surrogate)
+                    and kl <= config.max_kl
+                    and new_surrogate > old_surrogate
+                ):
                     gain = float(new_surrogate - old_surrogate)
-                    stats.update(kl=float(kl), surrogate_gain=gain, step_size=config.backtrack**k, line_search="accepted")
+                    stats.update(
+                        kl=float(kl),
+                        surrogate_gain=gain,
+                        step_size=config.backtrack**k,
+                        line_search="accepted",
+                    )
                     break
             else:
                 vector_to_parameters(old, policy.parameters())
@@ -168,12 +189,17 @@ def value_update(value, optimizer, obs, returns, config, generator):
     next rollout, and the numbers do not depend on when.
     """
     value.returns.update(returns[:, None])
-    inputs, target = value.normalizer(obs), (returns[:, None] - value.returns.mean) / value.returns.std
+    inputs, target = (
+        value.normalizer(obs),
+        (returns[:, None] - value.returns.mean) / value.returns.std,
+    )
     orders = [torch.randperm(len(obs), generator=generator) for _ in range(config.value_epochs)]
 
     def fit():
         for order in orders:
-            for x, y in zip(inputs[order].split(config.value_batch), target[order].split(config.value_batch)):
+            for x, y in zip(
+                inputs[order].split(config.value_batch), target[order].split(config.value_batch)
+            ):
                 least_squares_step(value.net, optimizer, x, y)
 
     return fit
@@ -212,7 +238,11 @@ class TRPO:
 
     def state(self):
         """What a checkpoint needs to go on learning."""
-        return {"policy": self.policy.state_dict(), "value": self.value.state_dict(), "optimizer": self.optimizer.state_dict()}
+        return {
+            "policy": self.policy.state_dict(),
+            "value": self.value.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+        }
 
     def load(self, state):
         """Take over what state() returned."""
@@ -245,7 +275,9 @@ class TRPO:
                 stats, value_fit = self.update(batch, beside)
                 if adapt:
                     for network in (self.policy, self.value):
-                        network.normalizer.update(torch.from_numpy(batch["obs"].reshape(-1, batch["obs"].shape[-1])))
+                        network.normalizer.update(
+                            torch.from_numpy(batch["obs"].reshape(-1, batch["obs"].shape[-1]))
+                        )
                 if on_update:
                     on_update({"steps": done_steps, "return": returns_of.mean(batch), **stats})
             value_fit.result()
@@ -258,7 +290,16 @@ class TRPO:
             obs32 = np.asarray(obs, np.float32)
             action = act(torch.from_numpy(obs32)).numpy()
             obs, reward, terminated, truncated, info = env.step(np.clip(action, low, high))
-            rows.append((obs32, action, reward, terminated, terminated | truncated, info["next_obs"].astype(np.float32)))
+            rows.append(
+                (
+                    obs32,
+                    action,
+                    reward,
+                    terminated,
+                    terminated | truncated,
+                    info["next_obs"].astype(np.float32),
+                )
+            )
         names = ("obs", "action", "reward", "terminated", "done", "next_obs")
         return {name: np.stack(column) for name, column in zip(names, zip(*rows))}, obs
 
@@ -266,14 +307,27 @@ class TRPO:
     def advantages(self, batch):
         """GAE advantages and the values they are measured from, both (T, N)."""
         T, N = batch["reward"].shape
-        value = self.value(torch.from_numpy(batch["obs"]).flatten(0, 1)).numpy().reshape(T, N).astype(float)
+        value = (
+            self.value(torch.from_numpy(batch["obs"]).flatten(0, 1))
+            .numpy()
+            .reshape(T, N)
+            .astype(float)
+        )
         # the successor's value is the next row's, save where an episode or the batch ends
         next_value = np.concatenate((value[1:], np.zeros((1, N))))
         edge = batch["done"].copy()
         edge[-1] = True
         next_value[edge] = self.value(torch.from_numpy(batch["next_obs"][edge])).numpy()
         config = self.config
-        return gae(batch["reward"], value, next_value, batch["terminated"], batch["done"], config.gamma, config.lam), value
+        return gae(
+            batch["reward"],
+            value,
+            next_value,
+            batch["terminated"],
+            batch["done"],
+            config.gamma,
+            config.lam,
+        ), value
 
     def update(self, batch, beside):
         """Update the policy from collect()'s arrays and start fitting the value in `beside`, an executor.
@@ -284,8 +338,12 @@ class TRPO:
         returns = advantage + value
         obs, action = (torch.from_numpy(batch[k]).flatten(0, 1) for k in ("obs", "action"))
         targets = torch.from_numpy(returns.reshape(-1)).float()
-        value_fit = beside.submit(value_update(self.value, self.optimizer, obs, targets, self.config, self.generator))
-        stats = policy_update(self.policy, obs, action, torch.from_numpy(advantage.reshape(-1)), self.config)
+        value_fit = beside.submit(
+            value_update(self.value, self.optimizer, obs, targets, self.config, self.generator)
+        )
+        stats = policy_update(
+            self.policy, obs, action, torch.from_numpy(advantage.reshape(-1)), self.config
+        )
         stats["explained_variance"] = explained_variance(value, returns)
         stats["std"] = float(self.policy.log_std.detach().exp().mean())
         stats["reward"] = float(batch["reward"].mean())
@@ -330,7 +388,9 @@ def rollouts(policy, env, episodes, seed, deterministic=False):
                 action, before = np.clip(action.numpy(), low, high), obs
                 obs, reward, terminated, truncated, info = env.step(action)
                 after = info["next_obs"][alive].astype(np.float32)
-                rows.append((before[alive], action[alive], after, np.flatnonzero(alive) + len(returns)))
+                rows.append(
+                    (before[alive], action[alive], after, np.flatnonzero(alive) + len(returns))
+                )
                 total += reward * alive
                 alive &= ~(terminated | truncated)
             returns += list(total[wanted])
@@ -354,7 +414,9 @@ class Transitions:
         return Transitions(self.s[rows], self.a[rows], self.s_next[rows])
 
     def __add__(self, other):
-        return Transitions(*(np.concatenate((getattr(self, k), getattr(other, k))) for k in ("s", "a", "s_next")))
+        return Transitions(
+            *(np.concatenate((getattr(self, k), getattr(other, k))) for k in ("s", "a", "s_next"))
+        )
 
     def tensors(self):
         """The three arrays as torch tensors, sharing memory."""

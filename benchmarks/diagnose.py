@@ -9,9 +9,9 @@ falls of 1.5 s each. Seconds are those of the clock, and of all threads together
 """
 
 import argparse
-from pathlib import Path
 import sys
 import time
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -19,10 +19,10 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from diagnose import diagnose  # noqa: E402
+from diagnosis.command import diagnose  # noqa: E402
+from diagnosis.common.atomic_files import write_table  # noqa: E402
+from diagnosis.recordings.recording import Recording  # noqa: E402
 from envs import model_path  # noqa: E402
-from files import write_table  # noqa: E402
-from recordings import Recording  # noqa: E402
 
 ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><default><geom contype="0" conaffinity="0"/>
 <joint axis="0 1 0" damping="0.05" armature="0.01"/></default><worldbody><body name="upper"><joint name="shoulder"/>
@@ -38,7 +38,11 @@ def arm(seconds, seed):
     """(Recording, true qvel) of the arm with Coulomb friction in the elbow."""
     spec = mujoco.MjSpec.from_string(ARM)
     elbow = spec.joint("elbow")
-    elbow.frictionloss, elbow.solref_friction[:], elbow.solimp_friction[:3] = FRICTION, [0.004, 1], [0.999, 0.9999, 0.001]
+    elbow.frictionloss, elbow.solref_friction[:], elbow.solimp_friction[:3] = (
+        FRICTION,
+        [0.004, 1],
+        [0.999, 0.9999, 0.001],
+    )
     return run(spec.compile(), seconds, seed, 0.01, [1.0, 0.4])
 
 
@@ -56,31 +60,62 @@ def run(model, seconds, seed, interval, strength):
     """(Recording of noisy positions, true qvel) of a model driven by sines of some strength (nu,)."""
     rng, data, rows = np.random.default_rng(seed), mujoco.MjData(model), round(seconds / interval)
     clock, tones = interval * np.arange(rows), (3, model.nu)
-    ctrl = np.array([strength]) * np.sin(2 * np.pi * clock[:, None, None] * rng.uniform(0.2, 1.5, tones) + rng.uniform(0, 6, tones)).sum(1)
+    ctrl = np.array([strength]) * np.sin(
+        2 * np.pi * clock[:, None, None] * rng.uniform(0.2, 1.5, tones) + rng.uniform(0, 6, tones)
+    ).sum(1)
     qpos, qvel = np.empty((rows, model.nq)), np.empty((rows, model.nv))
     for t in range(rows):
         qpos[t], qvel[t], data.ctrl[:] = data.qpos, data.qvel, ctrl[t]
         mujoco.mj_step(model, data, round(interval / model.opt.timestep))
-    return Recording(f"run{seed}.csv", clock, qpos + NOISE * rng.normal(size=qpos.shape), np.full_like(qvel, np.nan), ctrl, {}), qvel
+    return Recording(
+        f"run{seed}.csv",
+        clock,
+        qpos + NOISE * rng.normal(size=qpos.shape),
+        np.full_like(qvel, np.nan),
+        ctrl,
+        {},
+    ), qvel
 
 
 def with_sysid(recording, qvel, chunk=100):
     """{parameter: value} by mujoco.sysid from the same rows, or None where it is not installed."""
     from mujoco import sysid
+
     if not hasattr(sysid, "optimize"):
         return None
     spec, parameters = mujoco.MjSpec.from_string(ARM), sysid.ParameterDict()
     for body, nominal in (("upper", 1.0), ("fore", 0.6)):
-        parameters.add(sysid.Parameter(f"mass {body}", nominal=nominal, min_value=0.1, max_value=5.0,
-                                       modifier=lambda s, p, b=body: setattr(s.body(b).geoms[0], "mass", p.value[0])))
+        parameters.add(
+            sysid.Parameter(
+                f"mass {body}",
+                nominal=nominal,
+                min_value=0.1,
+                max_value=5.0,
+                modifier=lambda s, p, b=body: setattr(s.body(b).geoms[0], "mass", p.value[0]),
+            )
+        )
     for joint in ("shoulder", "elbow"):
-        for field, nominal in (("armature", 0.01), ("damping", 0.05), ("frictionloss", 0.01)):  # at 0 it would not move
+        for field, nominal in (
+            ("armature", 0.01),
+            ("damping", 0.05),
+            ("frictionloss", 0.01),
+        ):  # at 0 it would not move
+
             def modify(s, p, j=joint, f=field):
                 if f == "damping":
                     s.joint(j).damping[0] = p.value[0]
                 else:
                     setattr(s.joint(j), f, p.value[0])
-            parameters.add(sysid.Parameter(f"{field} {joint}", nominal=nominal, min_value=0.0, max_value=2.0, modifier=modify))
+
+            parameters.add(
+                sysid.Parameter(
+                    f"{field} {joint}",
+                    nominal=nominal,
+                    min_value=0.0,
+                    max_value=2.0,
+                    modifier=modify,
+                )
+            )
     model, names, starts, controls, sensors = spec.compile(), [], [], [], []
     for first in range(0, len(recording.time) - chunk, chunk):
         rows = slice(first, first + chunk)
@@ -90,8 +125,12 @@ def with_sysid(recording, qvel, chunk=100):
         controls.append(sysid.TimeSeries(clock, recording.ctrl[rows]))
         sensors.append(sysid.TimeSeries.from_names(clock, recording.qpos[rows], model))
     sequences = sysid.ModelSequences("arm", spec, names, starts, controls, sensors)
-    found, _ = sysid.optimize(initial_params=parameters, residual_fn=sysid.build_residual_fn(models_sequences=[sequences]),
-                              optimizer="mujoco", verbose=False)
+    found, _ = sysid.optimize(
+        initial_params=parameters,
+        residual_fn=sysid.build_residual_fn(models_sequences=[sequences]),
+        optimizer="mujoco",
+        verbose=False,
+    )
     return {name: float(found[name].value[0]) for name in found.keys()}
 
 
@@ -109,8 +148,17 @@ def diagnosed(system, model, train, held_out):
     begun = spent()
     found = diagnose(model, train, held_out).summary["findings"]
     took = spent() - begun
-    return [{"system": system, "method": "diagnose", "parameter": f"{p['name']} {f['place']['name']}", **{k: p[k] for k in ("value", "low", "high")},
-             **times(took)} for f in found for p in f["parameters"]]
+    return [
+        {
+            "system": system,
+            "method": "diagnose",
+            "parameter": f"{p['name']} {f['place']['name']}",
+            **{k: p[k] for k in ("value", "low", "high")},
+            **times(took),
+        }
+        for f in found
+        for p in f["parameters"]
+    ]
 
 
 def main():
@@ -121,22 +169,64 @@ def main():
     train, qvel = arm(0.7 * options.seconds, 0)
     falls = [hopper(FALL, i)[0] for i in range(round(options.seconds / FALL))]
     number = round(0.7 * len(falls))
-    rows = diagnosed("two-joint arm", mujoco.MjSpec.from_string(ARM), [train], [arm(0.3 * options.seconds, 1)[0]])
+    rows = diagnosed(
+        "two-joint arm", mujoco.MjSpec.from_string(ARM), [train], [arm(0.3 * options.seconds, 1)[0]]
+    )
     begun = spent()
     try:
         found = with_sysid(train, qvel)
-    except Exception as error:  # an optional package of changing interface: its failure is a result, not ours
+    except (
+        Exception
+    ) as error:  # an optional package of changing interface: its failure is a result, not ours
         found = None
         print(f"mujoco.sysid failed: {type(error).__name__}: {error}", file=sys.stderr)
     took = spent() - begun
-    rows += [{"system": "two-joint arm", "method": "sysid", "parameter": name, "value": value, **times(took)} for name, value in (found or {}).items()]
+    rows += [
+        {
+            "system": "two-joint arm",
+            "method": "sysid",
+            "parameter": name,
+            "value": value,
+            **times(took),
+        }
+        for name, value in (found or {}).items()
+    ]
     rows += diagnosed("Hopper", "Hopper-v4", falls[:number], falls[number:])
     torso = mujoco.MjModel.from_xml_path(str(model_path("Hopper-v4"))).body("torso").mass[0]
-    truth = {"mass upper": 1.0, "mass fore": 0.6, "frictionloss shoulder": 0.0, "frictionloss elbow": FRICTION, "mass torso": HEAVIER * torso}
-    truth |= {f"{field} {joint}": value for joint in ("shoulder", "elbow") for field, value in (("armature", 0.01), ("damping", 0.05))}
+    truth = {
+        "mass upper": 1.0,
+        "mass fore": 0.6,
+        "frictionloss shoulder": 0.0,
+        "frictionloss elbow": FRICTION,
+        "mass torso": HEAVIER * torso,
+    }
+    truth |= {
+        f"{field} {joint}": value
+        for joint in ("shoulder", "elbow")
+        for field, value in (("armature", 0.01), ("damping", 0.05))
+    }
     options.out.parent.mkdir(exist_ok=True)
-    write_table(options.out, ("system", "method", "parameter", "value", "low", "high", "truth", "seconds", "cpu_seconds"),
-                ({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in {**row, "truth": truth.get(row["parameter"])}.items()} for row in rows))
+    write_table(
+        options.out,
+        (
+            "system",
+            "method",
+            "parameter",
+            "value",
+            "low",
+            "high",
+            "truth",
+            "seconds",
+            "cpu_seconds",
+        ),
+        (
+            {
+                k: f"{v:.5g}" if isinstance(v, float) else v
+                for k, v in {**row, "truth": truth.get(row["parameter"])}.items()
+            }
+            for row in rows
+        ),
+    )
     print(options.out.read_text())
 
 

@@ -7,18 +7,18 @@ and k are fitted to the whole drop, from 0.3 s on (until then some balls were no
 """
 
 import argparse
-from pathlib import Path
 import sys
+from pathlib import Path
 
 import mujoco
-from mujoco import minimize
 import numpy as np
+from mujoco import minimize
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.real import BALLS  # noqa: E402
-from files import write_table  # noqa: E402
+from diagnosis.common.atomic_files import write_table  # noqa: E402
 
 LAWS = {"constant": 0, "viscous": 1, "quadratic": 2}
 BEGIN, SUBSTEPS = 0.3, 4  # s; Runge-Kutta steps between two rows
@@ -44,15 +44,26 @@ def fitted(time, height, mass, power):
     usual = mass * 9.81 / 20.0**power
     begin = np.array([height[0], np.polyfit(time[:8] - time[0], height[:8], 1)[0], 0.3])
     scaled = lambda x: np.stack([x[0], x[1], x[2] * usual])
-    x, _ = minimize.least_squares(begin, lambda x: fallen(scaled(x), power, time, mass) - height[:, None],
-                                  bounds=[np.array([0, -40.0, -3.0]), np.array([200.0, 5.0, 3.0])], verbose=0)
+    x, _ = minimize.least_squares(
+        begin,
+        lambda x: fallen(scaled(x), power, time, mass) - height[:, None],
+        bounds=[np.array([0, -40.0, -3.0]), np.array([200.0, 5.0, 3.0])],
+        verbose=0,
+    )
     residual = fallen(scaled(x.reshape(3, 1)), power, time, mass)[:, 0] - height
     return float(np.sqrt(np.mean(residual**2))), float(np.ravel(x)[2] * usual)
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recordings", type=Path, default=ROOT / ".." / "shared" / "recordings", help="folder of the rigs")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        default=ROOT / ".." / "shared" / "recordings",
+        help="folder of the rigs",
+    )
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "drag_laws.csv")
     options = parser.parse_args()
     folder, rows = options.recordings / "ball_drop", []
@@ -66,7 +77,9 @@ def main():
             time, height = time[time >= BEGIN], height[time >= BEGIN]
             for law, power in LAWS.items():
                 rms, k = fitted(time, height, mass, power)
-                rows.append({"ball": ball, "drop": drop, "law": law, "rms": f"{rms:.4f}", "k": f"{k:.5g}"})
+                rows.append(
+                    {"ball": ball, "drop": drop, "law": law, "rms": f"{rms:.4f}", "k": f"{k:.5g}"}
+                )
                 print(*rows[-1].values())
     if rows:
         write_table(options.out, ("ball", "drop", "law", "rms", "k"), rows)

@@ -1,8 +1,9 @@
 """The example of the README: a real two-link arm, diagnosed, as numbers and as a picture.
 
-    python benchmarks/example.py            # diagnose, write results/example.csv, draw docs/diagnosis.png
-    python benchmarks/example.py --draw     # only draw what results/example.csv holds
+python benchmarks/example.py            # diagnose, write results/example.csv, draw docs/diagnosis.png
+python benchmarks/example.py --draw     # only draw what results/example.csv holds
 """
+
 import argparse
 import csv
 import glob
@@ -15,24 +16,46 @@ import numpy as np
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, ROOT)
 RIG = os.path.join(ROOT, "..", "shared", "recordings", "double_pendulum")
-TABLE, PICTURE = os.path.join(ROOT, "results", "example.csv"), os.path.join(ROOT, "docs", "diagnosis.png")
+TABLE, PICTURE = (
+    os.path.join(ROOT, "results", "example.csv"),
+    os.path.join(ROOT, "docs", "diagnosis.png"),
+)
 COLOURS = {"measured": "#1d2733", "nominal": "#c8500a", "corrected": "#0a66b0"}
 
 
 def compute():
     """Rows (panel, x, measured, nominal, corrected) of the three panels."""
-    import leftover
-    from diagnose import diagnose
-    diagnosis = diagnose(os.path.join(RIG, "model.xml"), sorted(glob.glob(os.path.join(RIG, "train*.csv"))),
-                         sorted(glob.glob(os.path.join(RIG, "heldout*.csv"))))
+    from diagnosis.command import diagnose
+    from diagnosis.recordings import inverse_dynamics
+
+    diagnosis = diagnose(
+        os.path.join(RIG, "model.xml"),
+        sorted(glob.glob(os.path.join(RIG, "train*.csv"))),
+        sorted(glob.glob(os.path.join(RIG, "heldout*.csv"))),
+    )
     rows = []
     trace = next(t for t in diagnosis.traces if t["channel"] == "qpos:elbow")
     for k in np.flatnonzero(trace["time"] <= 5)[::2]:
         rows.append(["elbow", trace["time"][k], *(trace[look][k] for look in COLOURS)])
     for point in diagnosis.summary["fit"]["held_out"]["curve"]:
-        rows.append(["horizon", point["seconds"], point.get("floor", np.nan), point["before"], point["after"]])
-    left = next(r for r in leftover.residuals(diagnosis, 800) if r["joint"] == "elbow" and r["variable"].startswith("velocity"))
-    rows += [["force", x, np.nan, before, after] for x, before, after in zip(left["x"], left["before"], left["after"])]
+        rows.append(
+            [
+                "horizon",
+                point["seconds"],
+                point.get("floor", np.nan),
+                point["before"],
+                point["after"],
+            ]
+        )
+    left = next(
+        r
+        for r in inverse_dynamics.residuals(diagnosis, 800)
+        if r["joint"] == "elbow" and r["variable"].startswith("velocity")
+    )
+    rows += [
+        ["force", x, np.nan, before, after]
+        for x, before, after in zip(left["x"], left["before"], left["after"])
+    ]
     return rows
 
 
@@ -40,20 +63,40 @@ def draw(rows):
     """Three panels: elbow angle over time, error against horizon, force left over against velocity."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
-
     from figures import binned
 
     def columns(panel):
         return np.array([[float(cell) for cell in row[1:]] for row in rows if row[0] == panel]).T
 
-    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.color": "#dde3e8"})
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.1), width_ratios=(2, 1, 1), layout="constrained")
+    plt.rcParams.update(
+        {
+            "font.size": 9,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.grid": True,
+            "grid.color": "#dde3e8",
+        }
+    )
+    figure, (left, middle, right) = plt.subplots(
+        1, 3, figsize=(11, 3.1), width_ratios=(2, 1, 1), layout="constrained"
+    )
     time, *looks = columns("elbow")
     known = np.isfinite(looks[0])
-    left.plot(time[known], looks[0][known], color=COLOURS["measured"], linewidth=4, alpha=0.3, label="recorded")
+    left.plot(
+        time[known],
+        looks[0][known],
+        color=COLOURS["measured"],
+        linewidth=4,
+        alpha=0.3,
+        label="recorded",
+    )
     for look, values in zip(("nominal", "corrected"), looks[1:]):
         left.plot(time, values, color=COLOURS[look], linewidth=1.3, label=look)
-    left.set(xlabel="time (s)", ylabel="elbow (rad)", title="held-out recording, predicted 0.3 s at a time")
+    left.set(
+        xlabel="time (s)",
+        ylabel="elbow (rad)",
+        title="held-out recording, predicted 0.3 s at a time",
+    )
     left.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, -0.01))
     left.set_ylim(min(looks[0][known]) - 0.9, None)
     seconds, floor, before, after = columns("horizon")
@@ -65,13 +108,21 @@ def draw(rows):
     for look, force in (("nominal", before), ("corrected", after)):
         right.plot(speed, force, ".", markersize=2, alpha=0.3, color=COLOURS[look])
         right.plot(*binned(speed, force, 16), color=COLOURS[look], linewidth=1.8)
-    right.set(xlabel="elbow velocity (rad/s)", ylabel="force left over (N·m)", title="force left over", xlim=(-7, 7), ylim=(-0.45, 0.45))
+    right.set(
+        xlabel="elbow velocity (rad/s)",
+        ylabel="force left over (N·m)",
+        title="force left over",
+        xlim=(-7, 7),
+        ylim=(-0.45, 0.45),
+    )
     os.makedirs(os.path.dirname(PICTURE), exist_ok=True)
     figure.savefig(PICTURE, dpi=110)
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--draw", action="store_true", help="only draw")
     if not parser.parse_args().draw:
         if not os.path.isdir(RIG):
@@ -81,7 +132,9 @@ def main():
         with open(TABLE, "w", newline="") as stream:
             writer = csv.writer(stream)
             writer.writerow(["panel", "x", "measured", "nominal", "corrected"])
-            writer.writerows([[panel, *(f"{value:.6g}" for value in values)] for panel, *values in rows])
+            writer.writerows(
+                [[panel, *(f"{value:.6g}" for value in values)] for panel, *values in rows]
+            )
     with open(TABLE, newline="") as stream:
         draw(list(csv.reader(stream))[1:])
 

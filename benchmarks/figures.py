@@ -1,6 +1,6 @@
 """The README's figures and tables of the grounding runs, drawn from the committed CSVs.
 
-    python benchmarks/figures.py        # results/grounding.png, transitions.png, and the tables on the terminal as Markdown
+python benchmarks/figures.py        # results/grounding.png, transitions.png, and the tables on the terminal as Markdown
 """
 
 import csv
@@ -11,7 +11,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
-COLORS = {"rgat": "#1f5fa8", "gat": "#d98b1f", "ane": "#7b5aa6", "sim": "#c0392b", "real": "#2e8b57", "oracle": "#555555", "physics": "#0f8b8d"}
+COLORS = {
+    "rgat": "#1f5fa8",
+    "gat": "#d98b1f",
+    "ane": "#7b5aa6",
+    "sim": "#c0392b",
+    "real": "#2e8b57",
+    "oracle": "#555555",
+    "physics": "#0f8b8d",
+}
 
 
 def read(name):
@@ -23,7 +31,9 @@ def curves(rows):
     """{(env, policy, tag): {algo: {seed: returns by grounding step}}}"""
     table = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in rows:
-        table[row["env"], row["policy"], row["tag"]][row["algo"]][int(row["seed"])].append(float(row["real_return_deterministic"]))
+        table[row["env"], row["policy"], row["tag"]][row["algo"]][int(row["seed"])].append(
+            float(row["real_return_deterministic"])
+        )
     return table
 
 
@@ -41,7 +51,9 @@ def panels(count):
 def draw_grounding(rows, best):
     """One panel per task: every seed thin, the mean thick with its standard error, both reference lines."""
     told = [(key, algos) for key, algos in curves(rows).items() if key[2] == "default"]
-    table = dict(sorted(told, key=lambda item: "Hopper" not in item[0][0]))  # where grounding shows, first
+    table = dict(
+        sorted(told, key=lambda item: "Hopper" not in item[0][0])
+    )  # where grounding shows, first
     figure, all_axes = panels(len(table))
     for axes, ((env, policy, _), algos) in zip(all_axes, table.items()):
         for algo, seeds in algos.items():
@@ -49,15 +61,51 @@ def draw_grounding(rows, best):
                 axes.plot(returns, color=COLORS[algo], lw=0.6, alpha=0.3)
             length = min(map(len, seeds.values()))
             values = np.array([returns[:length] for returns in seeds.values()])
-            mean, se = values.mean(0), values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.zeros(length)
-            axes.plot(mean, color=COLORS[algo], lw=2, marker="o", ms=3, label=f"{algo}, {seeds_of(values)}")
-            axes.fill_between(range(length), mean - se, mean + se, color=COLORS[algo], alpha=0.2, lw=0)
-        lines = [row for row in best if (row["env"], row["policy"], row["tag"], row["algo"]) == (env, policy, "default", "rgat")]
-        for column, color in (("trained_on_real", COLORS["real"]), ("before_grounding", COLORS["sim"])):
-            values = [float(v) for v in {row["seed"]: row[column] for row in lines if row[column]}.values()]
+            mean, se = (
+                values.mean(0),
+                values.std(0, ddof=1) / np.sqrt(len(values))
+                if len(values) > 1
+                else np.zeros(length),
+            )
+            axes.plot(
+                mean,
+                color=COLORS[algo],
+                lw=2,
+                marker="o",
+                ms=3,
+                label=f"{algo}, {seeds_of(values)}",
+            )
+            axes.fill_between(
+                range(length), mean - se, mean + se, color=COLORS[algo], alpha=0.2, lw=0
+            )
+        lines = [
+            row
+            for row in best
+            if (row["env"], row["policy"], row["tag"], row["algo"])
+            == (env, policy, "default", "rgat")
+        ]
+        for column, color in (
+            ("trained_on_real", COLORS["real"]),
+            ("before_grounding", COLORS["sim"]),
+        ):
+            values = [
+                float(v)
+                for v in {row["seed"]: row[column] for row in lines if row[column]}.values()
+            ]
             if values:
-                axes.axhline(np.mean(values), color=color, lw=1.2, ls="--", label=f"{column.replace('_', ' ')}, mean of {len(values)}")
-        axes.set(title=f"{env}, {policy} policy", xlabel="grounding step", ylabel="return on real, deterministic", ylim=(0, None))
+                axes.axhline(
+                    np.mean(values),
+                    color=color,
+                    lw=1.2,
+                    ls="--",
+                    label=f"{column.replace('_', ' ')}, mean of {len(values)}",
+                )
+        axes.set(
+            title=f"{env}, {policy} policy",
+            xlabel="grounding step",
+            ylabel="return on real, deterministic",
+            ylim=(0, None),
+        )
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.legend(fontsize=7, ncols=2, loc="lower right")
     figure.savefig(RESULTS / "grounding.png", dpi=110)
@@ -69,8 +117,19 @@ def seeds_of(values):
 
 def draw_transitions(rows, best):
     """Return on real against the real transitions that it took: diagnosis beside RGAT, every seed a line."""
-    mine = [r for r in rows if r["tag"] == "default" and r["policy"] == "deep" and r["algo"] in ("physics", "rgat") and int(r["grounding_step"])]
-    tasks = [env for env in sorted({r["env"] for r in mine}) if any(r["env"] == env and r["algo"] == "physics" for r in mine)]
+    mine = [
+        r
+        for r in rows
+        if r["tag"] == "default"
+        and r["policy"] == "deep"
+        and r["algo"] in ("physics", "rgat")
+        and int(r["grounding_step"])
+    ]
+    tasks = [
+        env
+        for env in sorted({r["env"] for r in mine})
+        if any(r["env"] == env and r["algo"] == "physics" for r in mine)
+    ]
     if not tasks:
         return
     figure, all_axes = panels(len(tasks))
@@ -79,28 +138,74 @@ def draw_transitions(rows, best):
             seeds = sorted({r["seed"] for r in mine if (r["env"], r["algo"]) == (env, algo)})
             for i, seed in enumerate(seeds):
                 run = [r for r in mine if (r["env"], r["algo"], r["seed"]) == (env, algo, seed)]
-                x, y = ([float(r[k]) for r in run] for k in ("real_transitions", "real_return_deterministic"))
+                x, y = (
+                    [float(r[k]) for r in run]
+                    for k in ("real_transitions", "real_return_deterministic")
+                )
                 label = None if i else f"{algo}, {seeds_of(seeds)}"
-                axes.semilogx(x, y, color=COLORS[algo], lw=1, marker="o", ms=4, alpha=0.7, label=label)
-        lines = {r["seed"]: float(r["trained_on_real"]) for r in best if (r["env"], r["policy"], r["algo"]) == (env, "deep", "rgat")}
-        axes.axhline(np.mean(list(lines.values())), color=COLORS["real"], lw=1.2, ls="--", label="trained on real, mean")
-        axes.set(title=env, xlabel="real transitions used", ylabel="return on real, deterministic", ylim=(0, None))
+                axes.semilogx(
+                    x, y, color=COLORS[algo], lw=1, marker="o", ms=4, alpha=0.7, label=label
+                )
+        lines = {
+            r["seed"]: float(r["trained_on_real"])
+            for r in best
+            if (r["env"], r["policy"], r["algo"]) == (env, "deep", "rgat")
+        }
+        axes.axhline(
+            np.mean(list(lines.values())),
+            color=COLORS["real"],
+            lw=1.2,
+            ls="--",
+            label="trained on real, mean",
+        )
+        axes.set(
+            title=env,
+            xlabel="real transitions used",
+            ylabel="return on real, deterministic",
+            ylim=(0, None),
+        )
         axes.legend(fontsize=7)
     figure.savefig(RESULTS / "transitions.png", dpi=110)
 
 
 def table(rows, best):
     """Markdown: the last step's mean, and the best step re-evaluated on fresh episodes, per task and method."""
-    titles = ["task", "policy", "method", "seeds", "before, median", "last step, mean (each)", "best step on fresh episodes, median (each)", "`real` line, median"]
+    titles = [
+        "task",
+        "policy",
+        "method",
+        "seeds",
+        "before, median",
+        "last step, mean (each)",
+        "best step on fresh episodes, median (each)",
+        "`real` line, median",
+    ]
     print("\n| " + " | ".join(titles) + " |\n" + "|---" * len(titles) + "|")
     each = lambda values: f"({', '.join(f'{v:.0f}' for v in values)})"
     for (env, policy, tag), algos in sorted(curves(rows).items()):
         for algo, seeds in algos.items():
             last = [returns[-1] for returns in seeds.values()]
-            mine = [row for row in best if (row["env"], row["policy"], row["tag"], row["algo"]) == (env, policy, tag, algo)]
-            fresh, real, before = ([float(r[k]) for r in mine] for k in ("real_return_deterministic", "trained_on_real", "before_grounding"))
-            cells = [env, policy, algo if tag == "default" else f"{algo} ({tag})", len(last), f"{np.median(before):.0f}"]
-            cells += [f"{np.mean(last):.0f} {each(last)}", f"{np.median(fresh):.0f} {each(fresh)}", f"{np.median(real):.0f}"]
+            mine = [
+                row
+                for row in best
+                if (row["env"], row["policy"], row["tag"], row["algo"]) == (env, policy, tag, algo)
+            ]
+            fresh, real, before = (
+                [float(r[k]) for r in mine]
+                for k in ("real_return_deterministic", "trained_on_real", "before_grounding")
+            )
+            cells = [
+                env,
+                policy,
+                algo if tag == "default" else f"{algo} ({tag})",
+                len(last),
+                f"{np.median(before):.0f}",
+            ]
+            cells += [
+                f"{np.mean(last):.0f} {each(last)}",
+                f"{np.median(fresh):.0f} {each(fresh)}",
+                f"{np.median(real):.0f}",
+            ]
             print("| " + " | ".join(map(str, cells)) + " |")
 
 
@@ -109,7 +214,9 @@ def walking(rows, enough=3000):
     print()
     for algo, seeds in curves(rows)["Hopper-v4", "deep", "default"].items():
         rounds = [value for returns in seeds.values() for value in returns[1:]]
-        print(f"Hopper-v4 {algo}: above {enough} after {sum(value > enough for value in rounds)} of {len(rounds)} rounds")
+        print(
+            f"Hopper-v4 {algo}: above {enough} after {sum(value > enough for value in rounds)} of {len(rounds)} rounds"
+        )
 
 
 def trpo_table(rows):
@@ -117,23 +224,45 @@ def trpo_table(rows):
     groups = defaultdict(list)
     for row in rows:
         groups[row["env"], row["implementation"]].append(row)
-    print("\n| environment | implementation | steps | deterministic, median (each) | stochastic, median | CPU seconds |\n|---|---|---|---|---|---|")
+    print(
+        "\n| environment | implementation | steps | deterministic, median (each) | stochastic, median | CPU seconds |\n|---|---|---|---|---|---|"
+    )
     for (env, implementation), mine in sorted(groups.items()):
-        returns, noisy, seconds = ([float(r[k]) for r in mine] for k in ("return_deterministic", "return_stochastic", "seconds"))
+        returns, noisy, seconds = (
+            [float(r[k]) for r in mine]
+            for k in ("return_deterministic", "return_stochastic", "seconds")
+        )
         every = ", ".join(f"{v:.0f}" for v in returns)
-        print(f"| {env} | {implementation} | {int(mine[0]['steps']):,} | {np.median(returns):.0f} ({every}) | {np.median(noisy):.0f} | {np.median(seconds):.0f} |")
+        print(
+            f"| {env} | {implementation} | {int(mine[0]['steps']):,} | {np.median(returns):.0f} ({every}) | {np.median(noisy):.0f} | {np.median(seconds):.0f} |"
+        )
 
 
 def settings_table(rows):
     """Markdown: what a frozen policy returns in the grounded simulator under each variant, and the one-step error; seed by seed."""
-    print("\n| method | units of R_AT | f_ψ | γ_AT | max KL | std | error of f_ψ | one-step error | return, stochastic | deterministic |")
+    print(
+        "\n| method | units of R_AT | f_ψ | γ_AT | max KL | std | error of f_ψ | one-step error | return, stochastic | deterministic |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|")
     variants = defaultdict(list)
     for row in rows:
-        variants[tuple(row[k] for k in ("method", "norm", "forward_model", "at_gamma", "at_max_kl", "at_std"))].append(row)
+        variants[
+            tuple(
+                row[k]
+                for k in ("method", "norm", "forward_model", "at_gamma", "at_max_kl", "at_std")
+            )
+        ].append(row)
     for told, of_seeds in variants.items():
-        shown = [("forward_model_error", ".4f"), ("one_step_error", ".4f"), ("return_stochastic", ".0f"), ("return_deterministic", ".0f")]
-        cells = [", ".join(f"{float(row[k]):{digits}}" for row in of_seeds if row[k]) for k, digits in shown]
+        shown = [
+            ("forward_model_error", ".4f"),
+            ("one_step_error", ".4f"),
+            ("return_stochastic", ".0f"),
+            ("return_deterministic", ".0f"),
+        ]
+        cells = [
+            ", ".join(f"{float(row[k]):{digits}}" for row in of_seeds if row[k])
+            for k, digits in shown
+        ]
         print("| " + " | ".join([*told, *cells]) + " |")
 
 

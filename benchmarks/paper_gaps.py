@@ -20,9 +20,9 @@ sys.path.insert(0, str(ROOT))
 import train  # noqa: E402
 from benchmarks.rows import append, finished  # noqa: E402
 from benchmarks.transformer_settings import Quiet  # noqa: E402
-from diagnose import diagnose  # noqa: E402
+from diagnosis.command import diagnose  # noqa: E402
+from diagnosis.recordings.recording import Recording  # noqa: E402
 from envs import TASKS, BatchEnv, model_path, parse_perturbation  # noqa: E402
-from recordings import Recording  # noqa: E402
 
 NOISE = 1e-3  # m and rad
 CSV = ROOT / "results" / "paper_gaps.csv"
@@ -44,11 +44,15 @@ def episode(s, seed):
         obs, _, terminated, truncated, _ = real.step(action)
         ended = bool(terminated[0] | truncated[0])
     unmeasured = np.full((len(qpos), real.model.nv), np.nan)
-    return Recording("episode", real.dt * np.arange(len(qpos)), np.array(qpos), unmeasured, np.array(ctrl, float))
+    return Recording(
+        "episode", real.dt * np.arange(len(qpos)), np.array(qpos), unmeasured, np.array(ctrl, float)
+    )
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--envs", nargs="+", default=[f"{name}-v4" for name in TASKS])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     args = parser.parse_args()
@@ -57,16 +61,46 @@ def main():
         for seed in args.seeds:
             if finished(CSV, {"env": env_id, "seed": seed}):
                 continue
-            s = train.Settings(env=env_id, seed=seed, pretrained=str(ROOT / "runs" / "pretrained")).completed()
+            s = train.Settings(
+                env=env_id, seed=seed, pretrained=str(ROOT / "runs" / "pretrained")
+            ).completed()
             recording = episode(s, seed)
             began = time.process_time()
             summary = diagnose(model_path(env_id), [recording]).summary
             fit = summary["fit"]["held_out"]
-            common = {"env": env_id, "real": s.real, "seed": seed, "rows": len(recording.time), "verdict": summary["verdict"]}
+            common = {
+                "env": env_id,
+                "real": s.real,
+                "seed": seed,
+                "rows": len(recording.time),
+                "verdict": summary["verdict"],
+            }
             errors = {f"held_out_{k}": round(fit[k], 4) for k in ("before", "after", "floor")}
-            rows = [{**common, "effect": f["effect"], "place": f["place"]["name"], **described(f), **errors} for f in summary["findings"]]
-            rows = rows or [{**common, "effect": "", "place": "", "value": "", "low": "", "high": "", "also_possible": "", **errors}]
-            append(CSV, [{**row, "cpu_seconds": round(time.process_time() - began, 1)} for row in rows])
+            rows = [
+                {
+                    **common,
+                    "effect": f["effect"],
+                    "place": f["place"]["name"],
+                    **described(f),
+                    **errors,
+                }
+                for f in summary["findings"]
+            ]
+            rows = rows or [
+                {
+                    **common,
+                    "effect": "",
+                    "place": "",
+                    "value": "",
+                    "low": "",
+                    "high": "",
+                    "also_possible": "",
+                    **errors,
+                }
+            ]
+            append(
+                CSV, [{**row, "cpu_seconds": round(time.process_time() - began, 1)} for row in rows]
+            )
             for row in rows:
                 print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
 

@@ -7,31 +7,84 @@ Recordings are not part of this repository; what is absent is skipped, and keeps
 
 import argparse
 import csv
-from pathlib import Path
 import sys
 import time
+from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from diagnose import diagnose  # noqa: E402
-from files import write_table  # noqa: E402
+from diagnosis.command import diagnose  # noqa: E402
+from diagnosis.common.atomic_files import write_table  # noqa: E402
 
-BALLS = ("bowlingball", "baseball", "golfball", "volleyball", "tennisball", "whiffleball_1", "whiffleball_2", "whiffleball_orange",
-         "whiffleball_yellow", "basketball_blue", "basketball_green")
+BALLS = (
+    "bowlingball",
+    "baseball",
+    "golfball",
+    "volleyball",
+    "tennisball",
+    "whiffleball_1",
+    "whiffleball_2",
+    "whiffleball_orange",
+    "whiffleball_yellow",
+    "basketball_blue",
+    "basketball_green",
+)
 # rig, model, pattern of the recordings, what was published or is expected
-CASES = [("emps", "model.xml", "*", "viscous 203.5 N s/m, Coulomb 20.4 N, offset 3.16 N"),
-         ("emps", "model_viscous.xml", "*", "Coulomb 20.4 N, damping back to 203.5 N s/m, offset 3.16 N"),
-         ("double_pendulum", "model.xml", "*", "Coulomb 0.146 and 0.123 N m, armature 0.0036 kg m2"),
-         ("cube_toss", "model.xml", "*", "contact friction 0.18"),
-         ("arm_pendulum_single", "model.xml", "*", "viscous 2.24e-4 N m s/rad, or Coulomb 4.6e-4 N m with quadratic")]
-CASES += [("ball_drop", f"model_{b}.xml", b, "match" if b in BALLS[:3] else "quadratic damping or air drag") for b in BALLS]
-COLUMNS = ("rig", "model", "expected", "verdict", "effect", "place", "parameter", "value", "low", "high", "unit", "also_possible",
-           "held_out_before", "held_out_after", "held_out_floor", "channel", "unit_before", "unit_after", "seconds")
+CASES = [
+    ("emps", "model.xml", "*", "viscous 203.5 N s/m, Coulomb 20.4 N, offset 3.16 N"),
+    (
+        "emps",
+        "model_viscous.xml",
+        "*",
+        "Coulomb 20.4 N, damping back to 203.5 N s/m, offset 3.16 N",
+    ),
+    ("double_pendulum", "model.xml", "*", "Coulomb 0.146 and 0.123 N m, armature 0.0036 kg m2"),
+    ("cube_toss", "model.xml", "*", "contact friction 0.18"),
+    (
+        "arm_pendulum_single",
+        "model.xml",
+        "*",
+        "viscous 2.24e-4 N m s/rad, or Coulomb 4.6e-4 N m with quadratic",
+    ),
+]
+CASES += [
+    (
+        "ball_drop",
+        f"model_{b}.xml",
+        b,
+        "match" if b in BALLS[:3] else "quadratic damping or air drag",
+    )
+    for b in BALLS
+]
+COLUMNS = (
+    "rig",
+    "model",
+    "expected",
+    "verdict",
+    "effect",
+    "place",
+    "parameter",
+    "value",
+    "low",
+    "high",
+    "unit",
+    "also_possible",
+    "held_out_before",
+    "held_out_after",
+    "held_out_floor",
+    "channel",
+    "unit_before",
+    "unit_after",
+    "seconds",
+)
 
 
 def rows_of(folder, rig, model, pattern, expected):
-    train, held = (sorted(map(str, (folder / rig).glob(f"{kind}_{pattern}.csv"))) for kind in ("train", "heldout"))
+    train, held = (
+        sorted(map(str, (folder / rig).glob(f"{kind}_{pattern}.csv")))
+        for kind in ("train", "heldout")
+    )
     if not train or not (folder / rig / model).exists():
         print(f"{rig} {model}: not here, skipped")
         return []
@@ -39,21 +92,44 @@ def rows_of(folder, rig, model, pattern, expected):
     summary = diagnose(folder / rig / model, train, held).summary
     fit = summary["fit"]["held_out"]
     channel, figures = next(iter(fit["channels"].items()))
-    common = {"rig": rig, "model": model, "expected": expected, "verdict": summary["verdict"], "held_out_before": fit["before"],
-              "held_out_after": fit["after"], "held_out_floor": fit["floor"], "channel": channel, "unit_before": figures["before"],
-              "unit_after": figures["after"], "seconds": round(time.monotonic() - begun, 1)}
+    common = {
+        "rig": rig,
+        "model": model,
+        "expected": expected,
+        "verdict": summary["verdict"],
+        "held_out_before": fit["before"],
+        "held_out_after": fit["after"],
+        "held_out_floor": fit["floor"],
+        "channel": channel,
+        "unit_before": figures["before"],
+        "unit_after": figures["after"],
+        "seconds": round(time.monotonic() - begun, 1),
+    }
     out = []
     for finding in summary["findings"]:
         also = "; ".join(f"{a['effect']} {a['place']['name']}" for a in finding["also_possible"])
         for parameter in finding["parameters"] or [{}]:
-            out.append({**common, "effect": finding["effect"], "place": finding["place"]["name"], "parameter": parameter.get("name"),
-                        **{k: parameter.get(k) for k in ("value", "low", "high", "unit")}, "also_possible": also})
+            out.append(
+                {
+                    **common,
+                    "effect": finding["effect"],
+                    "place": finding["place"]["name"],
+                    "parameter": parameter.get("name"),
+                    **{k: parameter.get(k) for k in ("value", "low", "high", "unit")},
+                    "also_possible": also,
+                }
+            )
     return out or [common]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--recordings", type=Path, default=ROOT / ".." / "shared" / "recordings", help="folder of the rigs")
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        default=ROOT / ".." / "shared" / "recordings",
+        help="folder of the rigs",
+    )
     parser.add_argument("--only", nargs="*", help="rigs, or ball names, to do again (all)")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "real.csv")
     options = parser.parse_args()
@@ -66,9 +142,30 @@ def main():
             continue
         kept = [r for r in kept if (r["rig"], r["model"]) != case[:2]] + new
         for row in new:
-            print(*(row.get(k) for k in ("rig", "model", "verdict", "effect", "place", "value", "low", "high", "also_possible", "seconds")), flush=True)
+            print(
+                *(
+                    row.get(k)
+                    for k in (
+                        "rig",
+                        "model",
+                        "verdict",
+                        "effect",
+                        "place",
+                        "value",
+                        "low",
+                        "high",
+                        "also_possible",
+                        "seconds",
+                    )
+                ),
+                flush=True,
+            )
         options.out.parent.mkdir(exist_ok=True)
-        write_table(options.out, COLUMNS, ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in kept))
+        write_table(
+            options.out,
+            COLUMNS,
+            ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in kept),
+        )
 
 
 if __name__ == "__main__":

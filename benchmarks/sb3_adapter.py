@@ -1,7 +1,7 @@
 """Lets stable-baselines3 and sb3-contrib train in our batched environments, raw or grounded, with our settings.
 
-    model = trpo_model(BatchEnv("Hopper-v4", 32), TRPOConfig(), seed=0); model.learn(100_000)
-    returns = rollouts(ActingPolicy(model), env, 20, seed=0, deterministic=True)[0]
+model = trpo_model(BatchEnv("Hopper-v4", 32), TRPOConfig(), seed=0); model.learn(100_000)
+returns = rollouts(ActingPolicy(model), env, 20, seed=0, deterministic=True)[0]
 """
 
 import numpy as np
@@ -35,7 +35,10 @@ class SB3Env(VecEnv):
         done = terminated | truncated
         infos = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done):
-            infos[i] = {"terminal_observation": info["next_obs"][i], "TimeLimit.truncated": bool(truncated[i] and not terminated[i])}
+            infos[i] = {
+                "terminal_observation": info["next_obs"][i],
+                "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
+            }
         return obs, reward.astype(np.float32), done, infos
 
     def close(self):
@@ -77,7 +80,10 @@ def trpo_model(env, config, seed, hidden=(64, 64)):
         n_critic_updates=config.value_epochs,
         target_kl=config.max_kl,
         sub_sampling_factor=1,  # it would thin out the gradient and the line search too, not the Fisher product alone
-        policy_kwargs={"net_arch": {"pi": list(hidden), "vf": list(hidden)}, "activation_fn": torch.nn.Tanh},
+        policy_kwargs={
+            "net_arch": {"pi": list(hidden), "vf": list(hidden)},
+            "activation_fn": torch.nn.Tanh,
+        },
         seed=seed,
         device="cpu",
     )

@@ -75,7 +75,11 @@ class SB3:
         from stable_baselines3.common.monitor import Monitor
         from stable_baselines3.common.vec_env import DummyVecEnv
 
-        env = DummyVecEnv([lambda: Monitor(gymnasium.make(env_id))]) if stock else BatchEnv(env_id, num_envs, nthread=threads)
+        env = (
+            DummyVecEnv([lambda: Monitor(gymnasium.make(env_id))])
+            if stock
+            else BatchEnv(env_id, num_envs, nthread=threads)
+        )
         self.model = trpo_model(env, PRESETS[env_id.split("-")[0]], seed=0)
 
     def __call__(self, steps, clock):
@@ -97,20 +101,43 @@ def measure(env_id, num_envs, args):
     others = [SB3(env_id, num_envs, args.threads, stock) for stock in (True, False)]
     rates = []
     for round in range(args.rounds):
-        runs = [(lambda n, clock: physics(env_id, num_envs, args.threads, n, clock), args.batches), (ours, args.batches), *((sb3, 1) for sb3 in others)]
+        runs = [
+            (lambda n, clock: physics(env_id, num_envs, args.threads, n, clock), args.batches),
+            (ours, args.batches),
+            *((sb3, 1) for sb3 in others),
+        ]
         rates.append([batch * count / run(batch * count, clock) for run, count in runs])
-        print(f"{env_id}, round {round + 1}: " + ", ".join(f"{r:.0f}" for r in rates[-1]) + " steps/s", flush=True)
+        print(
+            f"{env_id}, round {round + 1}: "
+            + ", ".join(f"{r:.0f}" for r in rates[-1])
+            + " steps/s",
+            flush=True,
+        )
     return np.array(rates), memory
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--envs", nargs="+", default=["Hopper-v4", "HalfCheetah-v4"])
-    parser.add_argument("--num-envs", type=int, nargs="+", default=[Settings.num_envs, 4 * Settings.num_envs])
+    parser.add_argument(
+        "--num-envs", type=int, nargs="+", default=[Settings.num_envs, 4 * Settings.num_envs]
+    )
     parser.add_argument("--threads", type=int, default=0, help="cores to take (default: all)")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--batches", type=int, default=4, help="batches per round of (a) and (b); (c) gets one, being slow")
-    parser.add_argument("--clock", choices=["wall", "cpu"], default="wall", help="cpu counts this process's own time: for a busy machine, with --threads 1")
+    parser.add_argument(
+        "--batches",
+        type=int,
+        default=4,
+        help="batches per round of (a) and (b); (c) gets one, being slow",
+    )
+    parser.add_argument(
+        "--clock",
+        choices=["wall", "cpu"],
+        default="wall",
+        help="cpu counts this process's own time: for a busy machine, with --threads 1",
+    )
     parser.add_argument("--results", type=Path, default=ROOT / "results" / "throughput.csv")
     args = parser.parse_args(argv)
     rows = []
@@ -125,7 +152,11 @@ def main(argv=None):
             "physics_steps_per_s": round(a), "trpo_steps_per_s": round(b), "sb3_one_env_steps_per_s": round(stock), "sb3_batched_steps_per_s": round(batched),
             "trpo_to_physics": ratio(1, 0), "trpo_to_sb3_one_env": ratio(1, 2), "trpo_to_sb3_batched": ratio(1, 3), "peak_mib_beyond_torch": round(memory),
         })  # fmt: skip
-        print(f"{env_id}, {num_envs} environments: " + ", ".join(f"{k} {v}" for k, v in rows[-1].items() if k not in ("env", "num_envs")), flush=True)
+        print(
+            f"{env_id}, {num_envs} environments: "
+            + ", ".join(f"{k} {v}" for k, v in rows[-1].items() if k not in ("env", "num_envs")),
+            flush=True,
+        )
     args.results.parent.mkdir(parents=True, exist_ok=True)
     with args.results.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")

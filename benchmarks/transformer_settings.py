@@ -48,19 +48,28 @@ COLUMNS = ("method", "norm", "at_gamma", "at_max_kl", "at_std", "forward_model")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--env", required=True)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     args = parser.parse_args()
     torch.set_num_threads(1)
     for seed in args.seeds:
-        s = train.Settings(env=args.env, seed=seed, threads=1, pretrained=str(ROOT / "runs" / "pretrained")).completed()
+        s = train.Settings(
+            env=args.env, seed=seed, threads=1, pretrained=str(ROOT / "runs" / "pretrained")
+        ).completed()
         todo = [dict(zip(COLUMNS, values)) for values in VARIANTS]
-        todo = [{**v, "at_std": v["at_std"] or s.at_std} if v["method"] == "rgat" else v for v in todo]
+        todo = [
+            {**v, "at_std": v["at_std"] or s.at_std} if v["method"] == "rgat" else v for v in todo
+        ]
         todo = [v for v in todo if not finished(CSV, {"env": s.env, "seed": seed, **v})]
         if not todo:
             continue
-        sim, real = BatchEnv(s.env, s.num_envs, nthread=1), BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=1)
+        sim, real = (
+            BatchEnv(s.env, s.num_envs, nthread=1),
+            BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=1),
+        )
         learner = train.new_learner(s)
         learner.load(train.pretrained(s, "sim", sim, s.pretrain_steps, Quiet()))
         tau_real = rollouts(learner.policy, real, s.real_trajectories, seed + 1)[1]
@@ -69,9 +78,26 @@ def main():
             began = time.monotonic()
             grounding, world, fit = ground(s, v, sim, real, learner.policy, tau_real, seed)
             error, change = one_step_error(world, grounding.transformer, held_out)
-            returns = [rollouts(learner.policy, GroundedEnv(world, grounding.transformer), 64, seed, d)[0].mean() for d in (True, False)]
-            row = {"env": s.env, "seed": seed, **v, "at_steps": s.at_steps, "forward_model_error": "", **fit, "one_step_error": error}
-            row |= {"delta_action_rms": change, "return_deterministic": returns[0], "return_stochastic": returns[1]}
+            returns = [
+                rollouts(learner.policy, GroundedEnv(world, grounding.transformer), 64, seed, d)[
+                    0
+                ].mean()
+                for d in (True, False)
+            ]
+            row = {
+                "env": s.env,
+                "seed": seed,
+                **v,
+                "at_steps": s.at_steps,
+                "forward_model_error": "",
+                **fit,
+                "one_step_error": error,
+            }
+            row |= {
+                "delta_action_rms": change,
+                "return_deterministic": returns[0],
+                "return_stochastic": returns[1],
+            }
             append(CSV, [{**row, "seconds": round(time.monotonic() - began, 1)}])
 
 
@@ -81,8 +107,12 @@ def ground(s, v, sim, real, policy, tau_real, seed):
     settings = GroundingSettings(per_step=v["norm"] != "raw")
     if v["method"] == "rgat":
         at = dataclasses.replace(AT_CONFIG, max_kl=v["at_max_kl"], gamma=v["at_gamma"])
-        settings = dataclasses.replace(settings, at=at, at_std=v["at_std"], residual=v["forward_model"] == "residual")
-    grounding = method(world, settings, real.model) if v["method"] == "oracle" else method(world, settings)
+        settings = dataclasses.replace(
+            settings, at=at, at_std=v["at_std"], residual=v["forward_model"] == "residual"
+        )
+    grounding = (
+        method(world, settings, real.model) if v["method"] == "oracle" else method(world, settings)
+    )
     fit = grounding.fit(tau_real, seed)
     grounding.update(policy, s.at_steps, seed)
     return grounding, world, fit

@@ -46,9 +46,21 @@ def measure(seeds):
                 grounding.update(learner.policy, s.at_steps, seed)
                 a_hat = transformed(sim, grounding.transformer, held_out[pick])
                 a = held_out.a[pick, 0]
-                rows += [{"seed": seed, "world": world, "algo": algo, "a": f"{x:.5f}", "a_hat": f"{y:.5f}"} for x, y in zip(a, a_hat)]
+                rows += [
+                    {
+                        "seed": seed,
+                        "world": world,
+                        "algo": algo,
+                        "a": f"{x:.5f}",
+                        "a_hat": f"{y:.5f}",
+                    }
+                    for x, y in zip(a, a_hat)
+                ]
                 distance = np.sqrt(np.mean((a_hat - a) ** 2))
-                print(f"seed {seed}, {world}, {algo}: RMS distance from the identity {distance:.4f}", flush=True)
+                print(
+                    f"seed {seed}, {world}, {algo}: RMS distance from the identity {distance:.4f}",
+                    flush=True,
+                )
     with CSV.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -61,7 +73,9 @@ def transformed(sim, transformer, transitions):
     for rows in np.array_split(np.arange(len(transitions)), -(-len(transitions) // sim.num_envs)):
         part = transitions[np.resize(rows, sim.num_envs)]
         a_hat = []
-        sim.predict(part.s.astype(float), lambda obs: a_hat.append(transformer(obs, part.a)) or a_hat[0])
+        sim.predict(
+            part.s.astype(float), lambda obs: a_hat.append(transformer(obs, part.a)) or a_hat[0]
+        )
         out.append(a_hat[0][: len(rows), 0])
     return np.concatenate(out)
 
@@ -73,17 +87,28 @@ def draw():
     figure = Figure(figsize=(9, 6), layout="constrained")
     panels = [(algo, world) for algo in ("gat", "rgat") for world in WORLDS]
     for panel, (algo, world) in zip(figure.subplots(2, 3, sharex=True, sharey=True).flat, panels):
-        a, b = np.array([(float(r["a"]), float(r["a_hat"])) for r in rows if (r["algo"], r["world"]) == (algo, world)]).T
+        a, b = np.array(
+            [
+                (float(r["a"]), float(r["a_hat"]))
+                for r in rows
+                if (r["algo"], r["world"]) == (algo, world)
+            ]
+        ).T
         panel.plot([-3, 3], [-3, 3], color="black", lw=1)
         panel.scatter(a, b, s=4, alpha=0.4, color="#1f5fa8", lw=0)
-        panel.set_title(f"{algo.upper()}, {world}\nRMS from identity {np.sqrt(np.mean((a - b) ** 2)):.3f}", fontsize=9)
+        panel.set_title(
+            f"{algo.upper()}, {world}\nRMS from identity {np.sqrt(np.mean((a - b) ** 2)):.3f}",
+            fontsize=9,
+        )
     figure.supxlabel("action of the policy, a")
     figure.supylabel("transformed action")
     figure.savefig(CSV.with_suffix(".png"), dpi=110)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--draw", action="store_true", help="only draw results/transformers.csv")
     args = parser.parse_args()

@@ -43,7 +43,12 @@ def train_ours(name, config, seed, steps, num_envs, threads):
     s = Settings(env=name.partition(" ")[0], seed=seed, num_envs=num_envs).completed()
     learner = new_learner(s)
     learner.config = config
-    learner.learn(make_env(name, num_envs, threads), steps, seed_for(seed, 0, "pretrain"), freeze_normalizer=False)
+    learner.learn(
+        make_env(name, num_envs, threads),
+        steps,
+        seed_for(seed, 0, "pretrain"),
+        freeze_normalizer=False,
+    )
     return learner.policy
 
 
@@ -60,15 +65,36 @@ IMPLEMENTATIONS = {"ours": train_ours, "sb3-contrib": train_sb3}
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--implementations", nargs="+", choices=list(IMPLEMENTATIONS), default=list(IMPLEMENTATIONS))
-    parser.add_argument("--envs", nargs="+", help=f"default: {', '.join(ORIGINALS)}, and for ours these with the paper's changes")
-    parser.add_argument("--seeds", nargs="+", type=int, help="default: 0..4 for ours, 0..2 for sb3-contrib")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--implementations", nargs="+", choices=list(IMPLEMENTATIONS), default=list(IMPLEMENTATIONS)
+    )
+    parser.add_argument(
+        "--envs",
+        nargs="+",
+        help=f"default: {', '.join(ORIGINALS)}, and for ours these with the paper's changes",
+    )
+    parser.add_argument(
+        "--seeds", nargs="+", type=int, help="default: 0..4 for ours, 0..2 for sb3-contrib"
+    )
     parser.add_argument("--steps", type=int, help="default: 200k for the pendulum, 1M otherwise")
-    parser.add_argument("--max-kl", type=float, help="instead of the preset's; the column `implementation` then tells it too")
+    parser.add_argument(
+        "--max-kl",
+        type=float,
+        help="instead of the preset's; the column `implementation` then tells it too",
+    )
     parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--num-envs", type=int, default=Settings.num_envs, help="another number is told by the column `implementation` too")
-    parser.add_argument("--threads", type=int, default=0, help="cores for each training (default: all)")
+    parser.add_argument(
+        "--num-envs",
+        type=int,
+        default=Settings.num_envs,
+        help="another number is told by the column `implementation` too",
+    )
+    parser.add_argument(
+        "--threads", type=int, default=0, help="cores for each training (default: all)"
+    )
     parser.add_argument("--results", type=Path, default=ROOT / "results" / "trpo.csv")
     args = parser.parse_args(argv)
     if args.threads:
@@ -78,7 +104,10 @@ def main(argv=None):
             task = name.partition("-")[0]
             steps, config, label = args.steps or STEPS[task], PRESETS[task], implementation
             if args.max_kl:
-                config, label = dataclasses.replace(config, max_kl=args.max_kl), f"{label} max_kl={args.max_kl:g}"
+                config, label = (
+                    dataclasses.replace(config, max_kl=args.max_kl),
+                    f"{label} max_kl={args.max_kl:g}",
+                )
             if args.num_envs != Settings.num_envs:
                 label += f" num_envs={args.num_envs}"
             for seed in args.seeds or range(SEEDS[implementation]):
@@ -86,11 +115,20 @@ def main(argv=None):
                 if finished(args.results, key):
                     continue
                 start = time.process_time()
-                policy = IMPLEMENTATIONS[implementation](name, config, seed, steps, args.num_envs, args.threads)
+                policy = IMPLEMENTATIONS[implementation](
+                    name, config, seed, steps, args.num_envs, args.threads
+                )
                 seconds = time.process_time() - start
                 env = make_env(name, args.episodes, args.threads)
-                judge = lambda deterministic: float(np.mean(rollouts(policy, env, args.episodes, 10_000 + seed, deterministic)[0]))
-                row = {**key, "return_deterministic": round(judge(True), 1), "return_stochastic": round(judge(False), 1), "seconds": round(seconds, 1)}
+                judge = lambda deterministic: float(
+                    np.mean(rollouts(policy, env, args.episodes, 10_000 + seed, deterministic)[0])
+                )
+                row = {
+                    **key,
+                    "return_deterministic": round(judge(True), 1),
+                    "return_stochastic": round(judge(False), 1),
+                    "seconds": round(seconds, 1),
+                }
                 append(args.results, [row])
                 print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
 

@@ -1,8 +1,9 @@
 """Inputs that must be refused, made by code: one sound set of files, and some eighty ways to spoil it.
 
-    for name, case in cases().items():
-        argv = case.write(folder)        # the command line; must give exit status 2 and one line that holds case.says
+for name, case in cases().items():
+    argv = case.write(folder)        # the command line; must give exit status 2 and one line that holds case.says
 """
+
 import gzip
 import io
 import pickle
@@ -33,7 +34,15 @@ ARM = """
   <sensor><jointpos name="encoder" joint="shoulder"/></sensor>
 </mujoco>
 """
-HEADER = ["time", "qpos:shoulder", "qpos:elbow", "qvel:shoulder", "qvel:elbow", "ctrl:shoulder_motor", "ctrl:elbow_motor"]
+HEADER = [
+    "time",
+    "qpos:shoulder",
+    "qpos:elbow",
+    "qvel:shoulder",
+    "qvel:elbow",
+    "ctrl:shoulder_motor",
+    "ctrl:elbow_motor",
+]
 DT = 0.01
 
 
@@ -50,7 +59,11 @@ def run(seconds=4.0, seed=0, noise=2e-4, amplitude=1.0):
     rows = int(round(seconds / DT))
     t = DT * np.arange(rows)
     tones = rng.uniform(0.4, 1.6, (2, 3)), rng.uniform(0, 2 * np.pi, (2, 3))
-    ctrl = amplitude * np.array([[1.2], [0.4]]) * np.sin(2 * np.pi * tones[0][:, :, None] * t + tones[1][:, :, None]).mean(axis=1)
+    ctrl = (
+        amplitude
+        * np.array([[1.2], [0.4]])
+        * np.sin(2 * np.pi * tones[0][:, :, None] * t + tones[1][:, :, None]).mean(axis=1)
+    )
     table = np.empty((rows, 7))
     for row in range(rows):
         table[row] = [t[row], *data.qpos, *data.qvel, *ctrl[:, row]]
@@ -62,7 +75,9 @@ def run(seconds=4.0, seed=0, noise=2e-4, amplitude=1.0):
 
 def text(table, header=HEADER, separator=","):
     """A CSV as bytes."""
-    lines = [separator.join(header)] + [separator.join(f"{value:.9g}" for value in row) for row in table]
+    lines = [separator.join(header)] + [
+        separator.join(f"{value:.9g}" for value in row) for row in table
+    ]
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -75,15 +90,30 @@ def archive(**arrays):
 
 def whole(table):
     """The arrays of a sound NPZ."""
-    return {"time": table[:, 0], "qpos": table[:, 1:3], "qvel": table[:, 3:5], "ctrl": table[:, 5:7]}
+    return {
+        "time": table[:, 0],
+        "qpos": table[:, 1:3],
+        "qvel": table[:, 3:5],
+        "ctrl": table[:, 5:7],
+    }
 
 
 @dataclass
 class Case:
     """files: {name: bytes} to write; argv with {dir} for their folder; says: what the line must hold."""
+
     files: dict
     says: str
-    argv: list = field(default_factory=lambda: ["--model", "{dir}/arm.xml", "--recordings", "{dir}/run.csv", "--out", "{dir}/report"])
+    argv: list = field(
+        default_factory=lambda: [
+            "--model",
+            "{dir}/arm.xml",
+            "--recordings",
+            "{dir}/run.csv",
+            "--out",
+            "{dir}/report",
+        ]
+    )
 
     def write(self, folder):
         for name, data in {"arm.xml": ARM.encode(), **self.files}.items():
@@ -112,11 +142,26 @@ def cases():
         csv(name, text(spoiled if back is None else back, header), says)
 
     def npz(name, says, data=None, **arrays):
-        data = archive(**{k: v for k, v in {**whole(good), **arrays}.items() if v is not None}) if data is None else data
-        found[name] = Case({"run.npz": data}, says, ["--model", "{dir}/arm.xml", "--recordings", "{dir}/run.npz", "--out", "{dir}/report"])
+        data = (
+            archive(**{k: v for k, v in {**whole(good), **arrays}.items() if v is not None})
+            if data is None
+            else data
+        )
+        found[name] = Case(
+            {"run.npz": data},
+            says,
+            ["--model", "{dir}/arm.xml", "--recordings", "{dir}/run.npz", "--out", "{dir}/report"],
+        )
 
     def command(name, says, *argv, **files):
-        found[name] = Case({"run.csv": text(good), **{key.replace("_", "."): value for key, value in files.items()}}, says, list(argv))
+        found[name] = Case(
+            {
+                "run.csv": text(good),
+                **{key.replace("_", "."): value for key, value in files.items()},
+            },
+            says,
+            list(argv),
+        )
 
     def cell(row, column, value):
         lines = text(good).decode().split("\n")
@@ -127,7 +172,7 @@ def cases():
 
     def line(row, value):
         lines = text(good).decode().split("\n")
-        lines[row - 1:row] = value
+        lines[row - 1 : row] = value
         return "\n".join(lines).encode()
 
     def renamed(old, new):
@@ -138,10 +183,22 @@ def cases():
     csv("only white space", b" \n\n  \n", "empty")
     csv("header only", (",".join(HEADER) + "\n").encode(), "no rows")
     csv("one row", text(good[:1]), "not enough data")
-    csv("binary rubbish", np.random.default_rng(0).integers(0, 256, 4000).astype(np.uint8).tobytes(), "binary")
-    csv("rubbish without zeros", np.random.default_rng(1).integers(128, 256, 4000).astype(np.uint8).tobytes(), "UTF-8")
+    csv(
+        "binary rubbish",
+        np.random.default_rng(0).integers(0, 256, 4000).astype(np.uint8).tobytes(),
+        "binary",
+    )
+    csv(
+        "rubbish without zeros",
+        np.random.default_rng(1).integers(128, 256, 4000).astype(np.uint8).tobytes(),
+        "UTF-8",
+    )
     csv("UTF-16", text(good).decode().encode("utf-16"), "UTF-16")
-    csv("latin-1 comment", text(good).replace(b"qpos:elbow", "qpos:élbow".encode("latin-1"), 1), "UTF-8")
+    csv(
+        "latin-1 comment",
+        text(good).replace(b"qpos:elbow", "qpos:élbow".encode("latin-1"), 1),
+        "UTF-8",
+    )
     csv("prose", b"Dear colleague,\nthe recordings are attached.\n", "not a column")
     csv("JSON", b'{"time": [0, 1], "qpos": [[0, 1], [2, 3]]}', "not a column")
     csv("no header", text(good).split(b"\n", 1)[1], "header")
@@ -154,20 +211,53 @@ def cases():
     csv("unbalanced quote", b'"time,qpos:shoulder\n0,1\n', "header")
     csv("an NPZ called CSV, cut off", archive(**whole(good))[:300], "NPZ")
     csv("cut off in a row", text(good)[:-20], "cells")
-    found["a folder"] = Case({}, "folder", ["--model", "{dir}/arm.xml", "--recordings", "{dir}", "--out", "{dir}/report"])
-    found["a folder of recordings"] = Case({"run.csv": text(good)}, "name the files in it", found["a folder"].argv)
-    found["a copy under another name"] = Case({"run.csv": text(good), "copy.csv": text(good)}, "same rows",
-                                              [*found["a folder"].argv[:3], "{dir}/run.csv", "{dir}/copy.csv", "--out", "{dir}/report"])
-    found["a fitted file held out as a copy"] = Case(found["a copy under another name"].files, "same rows", [
-        *found["a folder"].argv[:3], "{dir}/run.csv", "--held-out", "{dir}/copy.csv", "--out", "{dir}/report"])
+    found["a folder"] = Case(
+        {}, "folder", ["--model", "{dir}/arm.xml", "--recordings", "{dir}", "--out", "{dir}/report"]
+    )
+    found["a folder of recordings"] = Case(
+        {"run.csv": text(good)}, "name the files in it", found["a folder"].argv
+    )
+    found["a copy under another name"] = Case(
+        {"run.csv": text(good), "copy.csv": text(good)},
+        "same rows",
+        [*found["a folder"].argv[:3], "{dir}/run.csv", "{dir}/copy.csv", "--out", "{dir}/report"],
+    )
+    found["a fitted file held out as a copy"] = Case(
+        found["a copy under another name"].files,
+        "same rows",
+        [
+            *found["a folder"].argv[:3],
+            "{dir}/run.csv",
+            "--held-out",
+            "{dir}/copy.csv",
+            "--out",
+            "{dir}/report",
+        ],
+    )
     found["no such file"] = Case({}, "no such file")
-    found["unmatched pattern"] = Case({}, "no such file", ["--model", "{dir}/arm.xml", "--recordings", "{dir}/*.csv", "--out", "{dir}/report"])
-    found["a device"] = Case({}, "regular file", ["--model", "{dir}/arm.xml", "--recordings", "/dev/null", "--out", "{dir}/report"])
+    found["unmatched pattern"] = Case(
+        {},
+        "no such file",
+        ["--model", "{dir}/arm.xml", "--recordings", "{dir}/*.csv", "--out", "{dir}/report"],
+    )
+    found["a device"] = Case(
+        {},
+        "regular file",
+        ["--model", "{dir}/arm.xml", "--recordings", "/dev/null", "--out", "{dir}/report"],
+    )
 
     # headers
-    csv("misspelt joint", text(good, renamed("qpos:elbow", "qpos:elbwo")), "did you mean 'qpos:elbow'")
+    csv(
+        "misspelt joint",
+        text(good, renamed("qpos:elbow", "qpos:elbwo")),
+        "did you mean 'qpos:elbow'",
+    )
     csv("joint of another model", text(good, renamed("qpos:elbow", "qpos:slider")), "qpos:slider")
-    csv("misspelt actuator", text(good, renamed("ctrl:elbow_motor", "ctrl:elbow")), "did you mean 'ctrl:elbow_motor'")
+    csv(
+        "misspelt actuator",
+        text(good, renamed("ctrl:elbow_motor", "ctrl:elbow")),
+        "did you mean 'ctrl:elbow_motor'",
+    )
     csv("unknown sensor", text(good, renamed("qvel:elbow", "sensor:gyro")), "sensor")
     csv("unknown kind", text(good, renamed("qvel:elbow", "torque:elbow")), "torque:elbow")
     csv("component of a hinge", text(good, renamed("qpos:elbow", "qpos:elbow:0")), "qpos:elbow:0")
@@ -175,7 +265,11 @@ def cases():
     csv("time twice", text(good, renamed("qvel:elbow", "time")), "twice")
     csv("nameless column", text(good, renamed("qvel:elbow", "")), "no name")
     csv("no time", text(good[:, 1:], HEADER[1:]), "'time'")
-    csv("no position of the elbow", text(np.delete(good, 2, 1), [h for h in HEADER if h != "qpos:elbow"]), "'qpos:elbow' is missing")
+    csv(
+        "no position of the elbow",
+        text(np.delete(good, 2, 1), [h for h in HEADER if h != "qpos:elbow"]),
+        "'qpos:elbow' is missing",
+    )
     csv("no control", text(good[:, :5], HEADER[:5]), "ctrl:shoulder_motor")
 
     # cells and rows
@@ -204,7 +298,11 @@ def cases():
     # time
     table("repeated time", "repeats", lambda x: x.__setitem__((50, 0), x[49, 0]))
     table("almost repeated time", "remove one", lambda x: x.__setitem__((50, 0), x[49, 0] + 1e-8))
-    table("time with too few digits", "more digits", lambda x: x.__setitem__((slice(None), 0), np.round(x[:, 0], 1)))
+    table(
+        "time with too few digits",
+        "more digits",
+        lambda x: x.__setitem__((slice(None), 0), np.round(x[:, 0], 1)),
+    )
     table("backward time", "backward", lambda x: x.__setitem__((50, 0), x[48, 0] + 0.001))
     table("two runs in one file", "backward", lambda x: np.vstack([x, x]))
     table("time reversed", "backward", lambda x: x[::-1])
@@ -212,28 +310,77 @@ def cases():
     table("time in ms", "milliseconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] * 1e3))
     table("time in us", "microseconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] * 1e6))
     table("time in ns", "nanoseconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] * 1e9))
-    table("time in days", "seconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] / 86400 / 100))
+    table(
+        "time in days", "seconds", lambda x: x.__setitem__((slice(None), 0), x[:, 0] / 86400 / 100)
+    )
     table("a gap", "gap", lambda x: np.delete(x, slice(100, 200), 0))
 
     # units and columns
     no_speed = (slice(None), slice(3, 5))
-    table("positions in degrees", "degrees", lambda x: (x.__setitem__((slice(None), slice(1, 3)), np.rad2deg(x[:, 1:3])), x.__setitem__(no_speed, np.nan))[0])
-    table("one position in degrees", "degrees", lambda x: (x.__setitem__((slice(None), 1), np.rad2deg(x[:, 1])), x.__setitem__(no_speed, np.nan))[0])
-    table("positions in degrees beside velocities", "degrees", lambda x: x.__setitem__((slice(None), 1), np.rad2deg(x[:, 1])))
-    table("velocities in degrees", "degrees", lambda x: x.__setitem__(no_speed, np.rad2deg(x[:, 3:5])))
+    table(
+        "positions in degrees",
+        "degrees",
+        lambda x: (
+            x.__setitem__((slice(None), slice(1, 3)), np.rad2deg(x[:, 1:3])),
+            x.__setitem__(no_speed, np.nan),
+        )[0],
+    )
+    table(
+        "one position in degrees",
+        "degrees",
+        lambda x: (
+            x.__setitem__((slice(None), 1), np.rad2deg(x[:, 1])),
+            x.__setitem__(no_speed, np.nan),
+        )[0],
+    )
+    table(
+        "positions in degrees beside velocities",
+        "degrees",
+        lambda x: x.__setitem__((slice(None), 1), np.rad2deg(x[:, 1])),
+    )
+    table(
+        "velocities in degrees", "degrees", lambda x: x.__setitem__(no_speed, np.rad2deg(x[:, 3:5]))
+    )
     table("velocities exchanged", "swapped", lambda x: x[:, [0, 1, 2, 4, 3, 5, 6]])
-    table("velocity turned round", "opposite sign", lambda x: x.__setitem__((slice(None), 3), -x[:, 3]))
+    table(
+        "velocity turned round",
+        "opposite sign",
+        lambda x: x.__setitem__((slice(None), 3), -x[:, 3]),
+    )
     table("positions exchanged", "exchanged", lambda x: x[:, [0, 2, 1, 4, 3, 5, 6]])
-    table("wrapped angle", "unwrap", lambda x: (x.__setitem__((slice(None), 1), (x[:, 1] + 6 * x[:, 0] + np.pi) % (2 * np.pi) - np.pi), x.__setitem__(no_speed, np.nan))[0])
-    table("control in mN m", "range", lambda x: x.__setitem__((slice(None), slice(5, 7)), 1000 * x[:, 5:7]))
+    table(
+        "wrapped angle",
+        "unwrap",
+        lambda x: (
+            x.__setitem__((slice(None), 1), (x[:, 1] + 6 * x[:, 0] + np.pi) % (2 * np.pi) - np.pi),
+            x.__setitem__(no_speed, np.nan),
+        )[0],
+    )
+    table(
+        "control in mN m",
+        "range",
+        lambda x: x.__setitem__((slice(None), slice(5, 7)), 1000 * x[:, 5:7]),
+    )
 
     # too little
-    table("nothing measured", "no position", lambda x: x.__setitem__((slice(None), slice(1, 3)), np.nan))
+    table(
+        "nothing measured",
+        "no position",
+        lambda x: x.__setitem__((slice(None), slice(1, 3)), np.nan),
+    )
     table("too few rows", "not enough data", lambda x: x[:12])
     table("too short to hold back", "not enough data", lambda x: x[:25])
     table("still", "not enough data", lambda x: x.__setitem__((slice(None), slice(1, 7)), 0.0))
-    table("only noise", "not enough data", lambda x: (x.__setitem__((slice(None), slice(5, 7)), 0.0), x.__setitem__((slice(None), slice(1, 5)),
-          np.random.default_rng(0).normal(size=(len(x), 4)) * 1e-3))[0])
+    table(
+        "only noise",
+        "not enough data",
+        lambda x: (
+            x.__setitem__((slice(None), slice(5, 7)), 0.0),
+            x.__setitem__(
+                (slice(None), slice(1, 5)), np.random.default_rng(0).normal(size=(len(x), 4)) * 1e-3
+            ),
+        )[0],
+    )
 
     # NPZ
     npz("NPZ with a pickle", "pickled", qpos=np.array([Exploit(), None], dtype=object))
@@ -252,7 +399,12 @@ def cases():
     npz("NPZ damaged", "NPZ", bytes(flipped))
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as z:
-        z.writestr("time.npy", b"\x93NUMPY\x01\x00\x76\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999999,), }".ljust(117) + b"\n")
+        z.writestr(
+            "time.npy",
+            b"\x93NUMPY\x01\x00\x76\x00"
+            + b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999999,), }".ljust(117)
+            + b"\n",
+        )
     npz("NPZ that claims terabytes", "NPZ", stream.getvalue())
     npz("NPZ without time", "'time' is missing", time=None)
     npz("NPZ without positions", "'qpos' is missing", qpos=None)
@@ -265,35 +417,123 @@ def cases():
     npz("NPZ times as a table", "'time'", time=good[:, :2])
     npz("NPZ of words", "real numbers", qpos=good[:, 1:3].astype(str))
     npz("NPZ complex", "real numbers", qpos=good[:, 1:3] + 1j)
-    npz("NPZ of dates", "real numbers", time=np.array(["2024-01-01"] * len(good), dtype="datetime64[s]"))
-    npz("NPZ control nan", "row 7", ctrl=np.where(np.arange(len(good))[:, None] == 7, np.nan, good[:, 5:7]))
+    npz(
+        "NPZ of dates",
+        "real numbers",
+        time=np.array(["2024-01-01"] * len(good), dtype="datetime64[s]"),
+    )
+    npz(
+        "NPZ control nan",
+        "row 7",
+        ctrl=np.where(np.arange(len(good))[:, None] == 7, np.nan, good[:, 5:7]),
+    )
     npz("NPZ unknown sensor", "sensor", **{"sensor:gyro": good[:, :3]})
 
     # models, folders, the command line
-    model, recordings, out = ["--model", "{dir}/arm.xml"], ["--recordings", "{dir}/run.csv"], ["--out", "{dir}/report"]
+    model, recordings, out = (
+        ["--model", "{dir}/arm.xml"],
+        ["--recordings", "{dir}/run.csv"],
+        ["--out", "{dir}/report"],
+    )
     command("no such model", "no such model", "--model", "{dir}/absent.xml", *recordings, *out)
     command("model is a folder", "no such model", "--model", "{dir}", *recordings, *out)
-    command("model empty", "does not load", "--model", "{dir}/bad.xml", *recordings, *out, bad_xml=b"")
-    command("model not XML", "does not load", "--model", "{dir}/bad.xml", *recordings, *out, bad_xml=b"hello")
-    command("model cut off", "does not load", "--model", "{dir}/bad.xml", *recordings, *out, bad_xml=ARM.encode()[:400])
-    command("model with an unknown element", "does not load", "--model", "{dir}/bad.xml", *recordings, *out, bad_xml=ARM.replace("<motor", "<engine", 1).encode())
-    command("model without a mesh's file", "does not load", "--model", "{dir}/bad.xml", *recordings, *out,
-            bad_xml=b'<mujoco><asset><mesh file="gone.stl"/></asset><worldbody/></mujoco>')
-    command("model without joints", "no joints", "--model", "{dir}/bad.xml", *recordings, *out, bad_xml=b"<mujoco><worldbody/></mujoco>")
-    command("model that blows up", "blows up", "--model", "{dir}/bad.xml", *recordings, *out,
-            bad_xml=ARM.replace('damping="0.05"', 'stiffness="-1e9"').replace("implicitfast", "Euler").encode())
+    command(
+        "model empty", "does not load", "--model", "{dir}/bad.xml", *recordings, *out, bad_xml=b""
+    )
+    command(
+        "model not XML",
+        "does not load",
+        "--model",
+        "{dir}/bad.xml",
+        *recordings,
+        *out,
+        bad_xml=b"hello",
+    )
+    command(
+        "model cut off",
+        "does not load",
+        "--model",
+        "{dir}/bad.xml",
+        *recordings,
+        *out,
+        bad_xml=ARM.encode()[:400],
+    )
+    command(
+        "model with an unknown element",
+        "does not load",
+        "--model",
+        "{dir}/bad.xml",
+        *recordings,
+        *out,
+        bad_xml=ARM.replace("<motor", "<engine", 1).encode(),
+    )
+    command(
+        "model without a mesh's file",
+        "does not load",
+        "--model",
+        "{dir}/bad.xml",
+        *recordings,
+        *out,
+        bad_xml=b'<mujoco><asset><mesh file="gone.stl"/></asset><worldbody/></mujoco>',
+    )
+    command(
+        "model without joints",
+        "no joints",
+        "--model",
+        "{dir}/bad.xml",
+        *recordings,
+        *out,
+        bad_xml=b"<mujoco><worldbody/></mujoco>",
+    )
+    command(
+        "model that blows up",
+        "blows up",
+        "--model",
+        "{dir}/bad.xml",
+        *recordings,
+        *out,
+        bad_xml=ARM.replace('damping="0.05"', 'stiffness="-1e9"')
+        .replace("implicitfast", "Euler")
+        .encode(),
+    )
     command("no such environment", "does not load", "--env", "NoSuchEnv-v9", *recordings, *out)
-    command("environment without MuJoCo", "does not load", "--env", "CartPole-v1", *recordings, *out)
+    command(
+        "environment without MuJoCo", "does not load", "--env", "CartPole-v1", *recordings, *out
+    )
     command("out is a file", "not a folder", *model, *recordings, "--out", "{dir}/run.csv")
-    command("out below a file", "not a folder", *model, *recordings, "--out", "{dir}/run.csv/report")
+    command(
+        "out below a file", "not a folder", *model, *recordings, "--out", "{dir}/run.csv/report"
+    )
     command("no arguments", "--help")
     command("no recordings", "recordings", *model, *out)
     command("recordings named by nobody", "recordings", *model, "--recordings", *out)
     command("neither model nor environment", "--model", *recordings, *out)
     command("both model and environment", "--env", *model, "--env", "Hopper-v5", *recordings, *out)
     command("unknown option", "--colour", *model, *recordings, *out, "--colour", "red")
-    command("a recording twice", "twice", *model, "--recordings", "{dir}/run.csv", "{dir}/run.csv", *out)
-    command("held out and fitted", "held out", *model, *recordings, "--held-out", "{dir}/run.csv", *out)
-    command("held out is empty", "empty", *model, *recordings, "--held-out", "{dir}/more.csv", *out, more_csv=b"")
-    command("second recording is bad", "more.csv", *model, "--recordings", "{dir}/run.csv", "{dir}/more.csv", *out, more_csv=text(good)[:-20])
+    command(
+        "a recording twice", "twice", *model, "--recordings", "{dir}/run.csv", "{dir}/run.csv", *out
+    )
+    command(
+        "held out and fitted", "held out", *model, *recordings, "--held-out", "{dir}/run.csv", *out
+    )
+    command(
+        "held out is empty",
+        "empty",
+        *model,
+        *recordings,
+        "--held-out",
+        "{dir}/more.csv",
+        *out,
+        more_csv=b"",
+    )
+    command(
+        "second recording is bad",
+        "more.csv",
+        *model,
+        "--recordings",
+        "{dir}/run.csv",
+        "{dir}/more.csv",
+        *out,
+        more_csv=text(good)[:-20],
+    )
     return found

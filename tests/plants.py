@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from recordings import Recording
-from world import Window, World
+from diagnosis.recordings.recording import Recording
+from diagnosis.simulation.simulator import Window, World
 
 ARM = """
 <mujoco model="arm">
@@ -30,30 +30,72 @@ ARM = """
   <sensor><jointpos name="angle" joint="elbow"/><gyro name="spin" site="s"/></sensor>
 </mujoco>""".replace('<geom name="tip"', '<site name="s" pos=".1 0 0"/><geom name="tip"')
 MOTORS = '<motor name="push" joint="lift" gear="20"/><motor joint="swing" gear="2"/><motor name="bend" joint="elbow" gear="0.5" forcerange="-4 4"/>'
-SERVOS = ('<velocity name="push" joint="lift" kv="60"/><position joint="swing" kp="30" kv="1.5"/>'
-          '<position name="bend" joint="elbow" kp="12" kv="0.4" forcerange="-3 3"/>')
-MODELS = {'motors': (MOTORS, 'implicitfast', 'radian'), 'servos': (SERVOS, 'implicitfast', 'degree'),
-          'euler': (MOTORS, 'Euler', 'degree'), 'rk4': (MOTORS, 'RK4', 'radian')}
+SERVOS = (
+    '<velocity name="push" joint="lift" kv="60"/><position joint="swing" kp="30" kv="1.5"/>'
+    '<position name="bend" joint="elbow" kp="12" kv="0.4" forcerange="-3 3"/>'
+)
+MODELS = {
+    "motors": (MOTORS, "implicitfast", "radian"),
+    "servos": (SERVOS, "implicitfast", "degree"),
+    "euler": (MOTORS, "Euler", "degree"),
+    "rk4": (MOTORS, "RK4", "radian"),
+}
 # a size at which each effect matters, as a function of its nominal values and steps
-SIZES = {'mass': (0.9,), 'center_of_mass': (0.12, 0.02, -0.03), 'inertia': (0.004, 0.005, 0.006), 'link_length': (0.36,), 'armature': (0.02,),
-         'viscous_damping': (0.3,), 'quadratic_damping': (0.15,), 'coulomb_friction': (0.2,), 'stribeck_friction': (0.1, 0.2, 0.3), 'stiffness': (1.5,),
-         'nonlinear_stiffness': (2.0,), 'spring_offset': (0.4,), 'cogging': (0.3, 7.0, 0.5), 'joint_stop': (-0.3, 0.25), 'backlash': (0.05,), 'gain': (1.3,),
-         'bias': (0.3,), 'back_emf': (0.6,), 'saturation': (1.0,), 'delay': (0.0053,), 'lag': (0.011,), 'dead_zone': (0.4,), 'gravity': (0.7, 0.0, -9.0),
-         'wind': (6.0, 1.0, -2.0), 'air_drag': (30.0,), 'time_step': (0.001,), 'contact_friction': (0.2,), 'contact_stiffness': (9000.0,),
-         'contact_damping': (40.0,), 'ground_height': (0.01,), 'sensor_bias': (0.05,), 'sensor_scale': (1.05,), 'sensor_delay': (0.0047,),
-         'external_force': (1.0, -0.5, 2.0), 'payload_change': (0.9,)}
+SIZES = {
+    "mass": (0.9,),
+    "center_of_mass": (0.12, 0.02, -0.03),
+    "inertia": (0.004, 0.005, 0.006),
+    "link_length": (0.36,),
+    "armature": (0.02,),
+    "viscous_damping": (0.3,),
+    "quadratic_damping": (0.15,),
+    "coulomb_friction": (0.2,),
+    "stribeck_friction": (0.1, 0.2, 0.3),
+    "stiffness": (1.5,),
+    "nonlinear_stiffness": (2.0,),
+    "spring_offset": (0.4,),
+    "cogging": (0.3, 7.0, 0.5),
+    "joint_stop": (-0.3, 0.25),
+    "backlash": (0.05,),
+    "gain": (1.3,),
+    "bias": (0.3,),
+    "back_emf": (0.6,),
+    "saturation": (1.0,),
+    "delay": (0.0053,),
+    "lag": (0.011,),
+    "dead_zone": (0.4,),
+    "gravity": (0.7, 0.0, -9.0),
+    "wind": (6.0, 1.0, -2.0),
+    "air_drag": (30.0,),
+    "time_step": (0.001,),
+    "contact_friction": (0.2,),
+    "contact_stiffness": (9000.0,),
+    "contact_damping": (40.0,),
+    "ground_height": (0.01,),
+    "sensor_bias": (0.05,),
+    "sensor_scale": (1.05,),
+    "sensor_delay": (0.0047,),
+    "external_force": (1.0, -0.5, 2.0),
+    "payload_change": (0.9,),
+}
 T, DT = 60, 0.01
 
 
 def arm(kind):
     """World and MJCF of an arm with a lift that reaches the floor; one actuator is unnamed."""
     actuators, integrator, angle = MODELS[kind]
-    degree = angle == 'degree'
-    xml = ARM.format(actuators=actuators, integrator=integrator, angle=angle, ref=20 if degree else 0.35, springref=-10 if degree else -0.2)
+    degree = angle == "degree"
+    xml = ARM.format(
+        actuators=actuators,
+        integrator=integrator,
+        angle=angle,
+        ref=20 if degree else 0.35,
+        springref=-10 if degree else -0.2,
+    )
     return World(mujoco.MjSpec.from_string(xml)), xml
 
 
-def commanded(time, ctrl=None, joints=1, name='made-up'):
+def commanded(time, ctrl=None, joints=1, name="made-up"):
     """A Recording of controls (T, nu), or of none, without measurements: what a simulation needs of one."""
     unread = np.full((len(time), joints), np.nan)
     return Recording(name, time, unread, unread, np.empty((len(time), 0)) if ctrl is None else ctrl)
@@ -62,7 +104,10 @@ def commanded(time, ctrl=None, joints=1, name='made-up'):
 def record(world, seed=0, rows=T, dt=DT):
     """A made-up recording: random held controls, made strong enough to move and touch the floor."""
     rng = np.random.default_rng(seed)
-    ctrl = np.repeat(rng.uniform(-1, 1, (rows // 4 + 1, world.model.nu)), 4, axis=0)[:rows] * [1.0, 2.0, 3.0][:world.model.nu]
+    ctrl = (
+        np.repeat(rng.uniform(-1, 1, (rows // 4 + 1, world.model.nu)), 4, axis=0)[:rows]
+        * [1.0, 2.0, 3.0][: world.model.nu]
+    )
     return commanded(np.arange(rows) * dt, ctrl, world.model.njnt)
 
 
@@ -74,7 +119,11 @@ def stock(xml, world, recording, qpos, qvel, rows=T):
     for name, q, v in zip(joints, qpos, qvel):
         data.joint(name).qpos, data.joint(name).qvel = q, v
     for a in range(world.model.nactuator):  # at rest in the first control
-        first = np.clip(recording.ctrl[0, a], *model.actuator_ctrlrange[a]) if model.actuator_ctrllimited[a] else recording.ctrl[0, a]
+        first = (
+            np.clip(recording.ctrl[0, a], *model.actuator_ctrlrange[a])
+            if model.actuator_ctrllimited[a]
+            else recording.ctrl[0, a]
+        )
         if model.actuator_delay[a] > 0:
             past = -model.opt.timestep * np.arange(model.actuator_history[a, 0], 0, -1)
             mujoco.mj_initCtrlHistory(model, data, a, past, np.full(len(past), first))
@@ -95,7 +144,12 @@ START = np.array([0.02, 0.4, -0.3]), np.array([0.1, -0.5, 0.8])
 
 def simulate(world, settings, recording, rows=T, **options):
     n = len(settings)
-    return world.simulate(settings, *(np.tile(x, (n, 1)) for x in START), [Window(recording, 0, rows - 1)] * n, **options)[0]
+    return world.simulate(
+        settings,
+        *(np.tile(x, (n, 1)) for x in START),
+        [Window(recording, 0, rows - 1)] * n,
+        **options,
+    )[0]
 
 
 PENDULUM = """
@@ -103,7 +157,7 @@ PENDULUM = """
 <inertial pos="0 0 -.1" mass=".5" diaginertia=".02 .02 .02"/></body></worldbody><actuator><motor name="m" joint="j"/></actuator></mujoco>"""
 
 
-def pendulum(integrator='implicitfast'):
+def pendulum(integrator="implicitfast"):
     return World(mujoco.MjSpec.from_string(PENDULUM.format(integrator)))
 
 
@@ -114,11 +168,53 @@ DROP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="
 
 def dropped(seed, damping):
     """A block falls from somewhere, bounces and lies still, in stock MuJoCo: few rows hold what its contact is like."""
-    rng, model = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(DROP.format(damping=damping))
+    rng, model = (
+        np.random.default_rng(seed),
+        mujoco.MjModel.from_xml_string(DROP.format(damping=damping)),
+    )
     data, qpos = mujoco.MjData(model), np.empty((150, 1))
     data.qpos[:] = rng.uniform(0.1, 0.3)
     for t in range(len(qpos)):
         qpos[t] = data.qpos
         mujoco.mj_step(model, data, 5)
     noisy = qpos + 1e-3 * rng.normal(size=qpos.shape)
-    return Recording(f"drop{seed}.csv", 0.01 * np.arange(len(qpos)), noisy, np.full(qpos.shape, np.nan), np.zeros((len(qpos), 0)), {})
+    return Recording(
+        f"drop{seed}.csv",
+        0.01 * np.arange(len(qpos)),
+        noisy,
+        np.full(qpos.shape, np.nan),
+        np.zeros((len(qpos), 0)),
+        {},
+    )
+
+
+PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="arm"><joint name="pivot" axis="0 1 0" damping="{damping}"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="{mass}" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><motor name="drive" joint="pivot"/></actuator></mujoco>"""
+
+NOISE = 5e-4
+
+
+def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=NOISE, finer=1):
+    """A run of the pendulum in stock MuJoCo: sines and steps, position measured every 10 ms with noise.
+
+    push(time, qpos, qvel): torque that no catalogue knows of.
+    """
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(PENDULUM.format(damping=damping, mass=mass))
+    model.opt.timestep /= finer
+    data = mujoco.MjData(model)
+    rows, period, phase = round(seconds / 0.01), rng.uniform(0.6, 1.2, 3), rng.uniform(0, 6, 3)
+    time = 0.01 * np.arange(rows)
+    ctrl = (0.2 * np.sin(2 * np.pi * time[:, None] / period + phase)).sum(1, keepdims=True)
+    qpos = np.empty((rows, 1))
+    data.qpos[:] = rng.uniform(-1, 1)
+    for t in range(rows):
+        qpos[t] = data.qpos
+        data.ctrl[:] = ctrl[t]
+        for _ in range(2 * finer):
+            data.qfrc_applied[:] = push(data.time, data.qpos[0], data.qvel[0]) if push else 0.0
+            mujoco.mj_step(model, data)
+    return Recording(
+        name, time, qpos + noise * rng.normal(size=qpos.shape), np.full((rows, 1), np.nan), ctrl, {}
+    )

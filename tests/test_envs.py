@@ -1,6 +1,5 @@
 """BatchEnv against gymnasium's own environments, perturbations against edited MJCF, grounding against the raw sim."""
-import os
-import sys
+
 import xml.etree.ElementTree as ET
 
 import gymnasium
@@ -9,11 +8,10 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import envs
 from envs import ENV_IDS, BatchEnv, EnvError, parse_perturbation, perturb, task_of
-from rgat import ActionTransformer, GroundedEnv, identity
 from models import GaussianPolicy
+from rgat import ActionTransformer, GroundedEnv, identity
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # gymnasium calls -v4 out of date
 
@@ -48,7 +46,9 @@ def replay_both(env_id, policy, steps, n=3, seed=11, **kwargs):
             for i in np.flatnonzero(done):
                 np.testing.assert_array_equal(info["next_obs"][i], their_info["final_obs"][i])
                 np.testing.assert_array_equal(info["final_obs"][i], their_info["final_obs"][i])
-                assert not np.array_equal(info["next_obs"][i], obs[i])  # not the next episode's first
+                assert not np.array_equal(
+                    info["next_obs"][i], obs[i]
+                )  # not the next episode's first
         falls, cuts = falls + terminated.sum(), cuts + truncated.sum()
     theirs.close()
     return falls, cuts
@@ -57,7 +57,9 @@ def replay_both(env_id, policy, steps, n=3, seed=11, **kwargs):
 def random_policy(env_id, n, scale=1.0, dtype=np.float32):
     space = BatchEnv(env_id, 1).single_action_space
     rng = np.random.default_rng(5)
-    return lambda t, obs: (scale * rng.uniform(space.low, space.high, (n, len(space.low)))).astype(dtype)
+    return lambda t, obs: (scale * rng.uniform(space.low, space.high, (n, len(space.low)))).astype(
+        dtype
+    )
 
 
 def balance(t, obs):
@@ -211,10 +213,22 @@ EDITS = {
     "hopper torso": ("Hopper-v4", "torso:mass*1.27", edited_torso),
     "cheetah torso": ("HalfCheetah-v4", "torso:mass*1.15", edited_cheetah),
     "damping": ("Hopper-v5", "foot_joint:damping=3.5", edited_joint("foot_joint", damping=3.5)),
-    "frictionloss": ("Hopper-v4", "leg_joint:frictionloss=0.5", edited_joint("leg_joint", frictionloss=0.5)),
+    "frictionloss": (
+        "Hopper-v4",
+        "leg_joint:frictionloss=0.5",
+        edited_joint("leg_joint", frictionloss=0.5),
+    ),
     "armature": ("HalfCheetah-v4", "bshin:armature*2", edited_joint("bshin", armature=0.2)),
-    "gain of an unnamed actuator": ("Hopper-v4", "thigh_joint:gain*0.8", edited_gear("thigh_joint", 160)),
-    "gain of a named actuator": ("InvertedPendulum-v4", "slide:gain*0.8", edited_gear("slider", 80)),
+    "gain of an unnamed actuator": (
+        "Hopper-v4",
+        "thigh_joint:gain*0.8",
+        edited_gear("thigh_joint", 160),
+    ),
+    "gain of a named actuator": (
+        "InvertedPendulum-v4",
+        "slide:gain*0.8",
+        edited_gear("slider", 80),
+    ),
     "gravity": ("InvertedPendulum-v5", "world:gravity*0.5", edited_gravity),
     "two at once": (
         "Hopper-v4",
@@ -240,14 +254,22 @@ def test_cheetahs_total_mass_grows():
     env = BatchEnv("HalfCheetah-v4", 1, parse_perturbation(task_of("HalfCheetah-v4").real))
     assert BatchEnv("HalfCheetah-v4", 1).model.body_mass.sum() == pytest.approx(14, abs=1e-9)
     assert env.model.body_mass.sum() == pytest.approx(14.94, abs=5e-3)
-    assert env.batch.model.body_subtreemass[0] == pytest.approx(env.model.body_mass.sum(), rel=1e-12)
+    assert env.batch.model.body_subtreemass[0] == pytest.approx(
+        env.model.body_mass.sum(), rel=1e-12
+    )
 
 
 def test_the_papers_worlds_are_the_defaults():
-    mass = lambda env_id, body, p="": BatchEnv(env_id, 1, parse_perturbation(p)).model.body(body).mass[0]
+    mass = lambda env_id, body, p="": (
+        BatchEnv(env_id, 1, parse_perturbation(p)).model.body(body).mass[0]
+    )
     for env_id, body, factor in (("Hopper-v5", "torso", 1.27), ("HalfCheetah-v5", "torso", 1.15)):
-        assert mass(env_id, body, task_of(env_id).real) == pytest.approx(factor * mass(env_id, body), rel=1e-12)
-    assert mass("InvertedPendulum-v4", "pole", task_of("InvertedPendulum-v4").real) == pytest.approx(100, rel=1e-12)
+        assert mass(env_id, body, task_of(env_id).real) == pytest.approx(
+            factor * mass(env_id, body), rel=1e-12
+        )
+    assert mass(
+        "InvertedPendulum-v4", "pole", task_of("InvertedPendulum-v4").real
+    ) == pytest.approx(100, rel=1e-12)
 
 
 def test_gravity_in_units_of_downward_acceleration():
@@ -332,7 +354,11 @@ def silent_transformer(nobs, space):
 @pytest.mark.parametrize("network", [False, True])
 def test_identity_grounding_is_the_raw_sim_bit_for_bit(env_id, network):
     raw, sim = BatchEnv(env_id, 3), BatchEnv(env_id, 3)
-    transformer = silent_transformer(sim.single_observation_space.shape[0], sim.single_action_space) if network else identity
+    transformer = (
+        silent_transformer(sim.single_observation_space.shape[0], sim.single_action_space)
+        if network
+        else identity
+    )
     grounded = GroundedEnv(sim, transformer)
     actions = random_policy(env_id, 3)
     np.testing.assert_array_equal(raw.reset(seed=1)[0], grounded.reset(seed=1)[0])
@@ -392,4 +418,6 @@ def test_predict_starts_from_observations(env_id):
         obs, _, _, _, info = walker.step(a)
         clipped = np.abs(before[:, -env.model.nv :]).max(1) >= env.task.clip_velocity
         # where the robot stands on the x axis is not observed; it moves the last digits alone
-        np.testing.assert_allclose(env.predict(before, a)[~clipped], info["next_obs"][~clipped], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(
+            env.predict(before, a)[~clipped], info["next_obs"][~clipped], rtol=0, atol=1e-7
+        )

@@ -1,15 +1,16 @@
 """Networks against torch.distributions and numpy; regressors on systems with a known answer; checkpoints good and bad."""
-import os
+
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
+ROOT = str(Path(__file__).resolve().parents[1])
 from models import (
     DEEP,
     MLP,
@@ -37,7 +38,9 @@ def gaussians(seed, n=7, k=3):
 
 
 def stock(mean, log_std):
-    return torch.distributions.Independent(torch.distributions.Normal(mean, log_std.exp().expand_as(mean)), 1)
+    return torch.distributions.Independent(
+        torch.distributions.Normal(mean, log_std.exp().expand_as(mean)), 1
+    )
 
 
 @given(seeds)
@@ -57,12 +60,17 @@ def test_policy_samples_its_own_distribution():
     obs = torch.randn(1, 4).expand(40_000, 4)
     sample = policy.act(obs, torch.Generator().manual_seed(1))
     torch.testing.assert_close(sample.mean(0), policy.mean(obs[:1])[0], atol=0.01, rtol=0)
-    torch.testing.assert_close(sample.std(0), torch.full((2,), float(np.exp(-0.5))), atol=0.01, rtol=0)
+    torch.testing.assert_close(
+        sample.std(0), torch.full((2,), float(np.exp(-0.5))), atol=0.01, rtol=0
+    )
     again = policy.act(obs, torch.Generator().manual_seed(1))
     torch.testing.assert_close(sample, again, atol=0, rtol=0)
 
 
-@pytest.mark.parametrize("hidden, count", [(DEEP, 11 * 64 + 64 + 64 * 64 + 64 + 64 * 3 + 3 + 3), (SHALLOW, 11 * 4 + 4 + 4 * 3 + 3 + 3)])
+@pytest.mark.parametrize(
+    "hidden, count",
+    [(DEEP, 11 * 64 + 64 + 64 * 64 + 64 + 64 * 3 + 3 + 3), (SHALLOW, 11 * 4 + 4 + 4 * 3 + 3 + 3)],
+)
 def test_the_papers_policies(hidden, count):
     policy = GaussianPolicy(11, 3, hidden)
     assert sum(p.numel() for p in policy.parameters()) == count
@@ -83,7 +91,11 @@ def small_network(seed, widths, rows=7):
     net = MLP(widths).double()
     for p in net.parameters():
         p.data += 0.3 * torch.randn_like(p)
-    return net, torch.randn(rows, widths[0], dtype=torch.float64), [torch.randn_like(p) for p in net.parameters()]
+    return (
+        net,
+        torch.randn(rows, widths[0], dtype=torch.float64),
+        [torch.randn_like(p) for p in net.parameters()],
+    )
 
 
 @given(seeds, widths)
@@ -92,7 +104,9 @@ def test_written_out_derivatives_equal_autograds(seed, widths):
     net, x, v = small_network(seed, widths)
     values, g = net.values(x), torch.randn(len(x), widths[-1], dtype=torch.float64)
     torch.testing.assert_close(values[-1], net(x).detach())
-    for ours, theirs in zip(net.gradient(values, g), torch.autograd.grad(net(x), list(net.parameters()), g), strict=True):
+    for ours, theirs in zip(
+        net.gradient(values, g), torch.autograd.grad(net(x), list(net.parameters()), g), strict=True
+    ):
         torch.testing.assert_close(ours, theirs)
     names = [name for name, _ in net.named_parameters()]
     at = lambda *weights: torch.func.functional_call(net, dict(zip(names, weights)), x)
@@ -104,7 +118,10 @@ def test_written_out_derivatives_equal_autograds(seed, widths):
 @settings(max_examples=20, deadline=None)
 def test_least_squares_steps_are_those_of_autograd_and_adam(seed, widths):
     nets = [small_network(seed, widths)[0] for _ in range(2)]
-    x, y = torch.randn(11, widths[0], dtype=torch.float64), torch.randn(11, widths[-1], dtype=torch.float64)
+    x, y = (
+        torch.randn(11, widths[0], dtype=torch.float64),
+        torch.randn(11, widths[-1], dtype=torch.float64),
+    )
     ours, theirs = adam(nets[0], 0.1), torch.optim.Adam(nets[1].parameters(), lr=0.1)
     for _ in range(3):
         least_squares_step(nets[0], ours, x, y)
@@ -144,7 +161,9 @@ def test_value_speaks_in_units_of_reward():
     value = Value(3)
     value.returns.update(torch.tensor([[100.0], [300.0]]))
     obs = torch.randn(6, 3)
-    torch.testing.assert_close(value(obs), 200 + 100 * value.net(value.normalizer(obs))[:, 0], rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(
+        value(obs), 200 + 100 * value.net(value.normalizer(obs))[:, 0], rtol=1e-5, atol=1e-3
+    )
 
 
 # --- supervised models --------------------------------------------------------------------------------
@@ -168,14 +187,18 @@ def test_forward_model_learns_a_linear_system():
         miss = ((model(*fresh[:2], fresh[0]) - fresh[2]) ** 2).mean(0).sqrt().numpy()
     spread = ((s_next - s) ** 2).mean(0).sqrt().numpy()
     assert (miss < 0.1 * spread).all()
-    assert (0.3 < error / miss).all() and (error / miss < 3).all()  # what fit says of itself is right
+    assert (0.3 < error / miss).all() and (
+        error / miss < 3
+    ).all()  # what fit says of itself is right
 
 
 def test_forward_model_that_starts_from_a_right_guess_stays_there():
     s, a, s_next = linear_system(600)
     torch.manual_seed(0)
     model = ForwardModel(4, 2)
-    assert (model.fit(s, a, s_next, s_next, torch.Generator().manual_seed(0), max_updates=50) < 1e-3).all()
+    assert (
+        model.fit(s, a, s_next, s_next, torch.Generator().manual_seed(0), max_updates=50) < 1e-3
+    ).all()
 
 
 def test_inverse_model_learns_a_linear_system():
@@ -185,7 +208,9 @@ def test_inverse_model_learns_a_linear_system():
     error = model.fit(s, s_next, a, torch.Generator().manual_seed(0), max_updates=800)
     with torch.no_grad():
         miss = ((model(s, s_next) - a) ** 2).mean(0).sqrt().numpy()
-    assert error.shape == (2,) and (error < 0.1).all() and (miss < 0.1).all()  # the actions reach from -1 to 1
+    assert (
+        error.shape == (2,) and (error < 0.1).all() and (miss < 0.1).all()
+    )  # the actions reach from -1 to 1
 
 
 def test_fit_keeps_the_best_weights_and_repeats():
@@ -211,7 +236,9 @@ def test_fit_normalises_by_the_training_rows():
     model.fit(s, s_next, a, torch.Generator().manual_seed(5), max_updates=5)
     train = torch.randperm(400, generator=torch.Generator().manual_seed(5))[80:]
     np.testing.assert_allclose(model.inputs.mean[:4], s[train].double().mean(0), atol=1e-4)
-    np.testing.assert_allclose(model.outputs.var, a[train].double().var(0, unbiased=False), atol=1e-4)
+    np.testing.assert_allclose(
+        model.outputs.var, a[train].double().var(0, unbiased=False), atol=1e-4
+    )
 
 
 # --- checkpoints --------------------------------------------------------------------------------------
@@ -261,10 +288,14 @@ def bad_files(folder):
     (folder / "empty.pt").write_bytes(b"")
     (folder / "text.pt").write_text("return,seed\n1,2\n")
     (folder / "truncated.pt").write_bytes(data[: len(data) // 2])
-    (folder / "flipped.pt").write_bytes(data[:200] + bytes(b ^ 255 for b in data[200:400]) + data[400:])
+    (folder / "flipped.pt").write_bytes(
+        data[:200] + bytes(b ^ 255 for b in data[200:400]) + data[400:]
+    )
     (folder / "folder.pt").mkdir()
     torch.save(Trap(folder / "sprung"), folder / "trap.pt")
-    torch.save({"sizes": [5, 64, 64, 2], "state": Trap(folder / "sprung")}, folder / "inner trap.pt")
+    torch.save(
+        {"sizes": [5, 64, 64, 2], "state": Trap(folder / "sprung")}, folder / "inner trap.pt"
+    )
     torch.save([1, 2, 3], folder / "list.pt")
     torch.save({"state": policy.state_dict()}, folder / "no sizes.pt")
     torch.save({"sizes": [5, 64, 2], "state": policy.state_dict()}, folder / "other sizes.pt")

@@ -1,17 +1,15 @@
 """Grounding methods: rewards and transformers by hand, the oracle against brute force, strangers training in the grounded sim."""
+
 import copy
-import os
-import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
-sys.path.append(os.path.join(ROOT, "benchmarks"))  # last: its trpo.py is another
+ROOT = str(Path(__file__).resolve().parents[1])
 from envs import BatchEnv, parse_perturbation, task_of
 from models import GaussianPolicy
 from rgat import (
@@ -21,8 +19,8 @@ from rgat import (
     RGAT,
     ActionTransformer,
     ActionTransformerEnv,
-    Grounding,
     GroundedEnv,
+    Grounding,
     GroundingSettings,
     Oracle,
     RealModel,
@@ -43,7 +41,9 @@ def world(env_id, n=4, real=False):
 
 def policy_for(env, seed=0, std=0.3):
     torch.manual_seed(seed)
-    policy = GaussianPolicy(env.single_observation_space.shape[0], env.single_action_space.shape[0], log_std=np.log(std))
+    policy = GaussianPolicy(
+        env.single_observation_space.shape[0], env.single_action_space.shape[0], log_std=np.log(std)
+    )
     policy.net[-1].weight.data.normal_(std=0.2)
     return policy
 
@@ -71,7 +71,9 @@ def test_the_transformers_reward_by_hand(residual):
     low, high = sim.single_action_space.low, sim.single_action_space.high
     transformer = ActionTransformer(GaussianPolicy(14, 3), low, high)
     scale = rng.uniform(0.1, 2, 11)
-    env = ActionTransformerEnv(sim, transformer, policy_for(sim), Prophet(predicted, guess, residual), scale, seed=3)
+    env = ActionTransformerEnv(
+        sim, transformer, policy_for(sim), Prophet(predicted, guess, residual), scale, seed=3
+    )
     assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     sa, _ = env.reset(seed=5)
     s, _ = twin.reset(seed=5)
@@ -79,17 +81,23 @@ def test_the_transformers_reward_by_hand(residual):
     for _ in range(60):
         np.testing.assert_array_equal(sa[:, :11], s.astype(np.float32))
         a, output = sa[:, 11:], rng.uniform(-0.3, 0.3, (4, 3))
-        s, _, fell, timeout, info = twin.step(a, applied=np.clip(a + 2 * output, -1, 1))  # the range of an action is 2
+        s, _, fell, timeout, info = twin.step(
+            a, applied=np.clip(a + 2 * output, -1, 1)
+        )  # the range of an action is 2
         sa, reward, terminated, truncated, at_info = env.step(output)
         expected = np.zeros(4)
         for i in range(4):
             for k in range(11):
                 expected[i] -= ((float(predicted[i, k]) - info["next_obs"][i, k]) / scale[k]) ** 2
-                expected[i] += residual * ((float(predicted[i, k]) - float(guess[i, k])) / scale[k]) ** 2
+                expected[i] += (
+                    residual * ((float(predicted[i, k]) - float(guess[i, k])) / scale[k]) ** 2
+                )
         np.testing.assert_allclose(reward, expected, rtol=1e-5, atol=1e-5)
         assert not terminated.any()  # ending an episode must never pay
         np.testing.assert_array_equal(truncated, fell | timeout)
-        np.testing.assert_array_equal(at_info["next_obs"][:, :11], info["next_obs"].astype(np.float32))
+        np.testing.assert_array_equal(
+            at_info["next_obs"][:, :11], info["next_obs"].astype(np.float32)
+        )
         cut += truncated.sum()
     assert cut > 0
 
@@ -112,7 +120,11 @@ def test_action_transformer_adds_its_mean_and_stays_in_bounds():
         p.data.zero_()
     policy.net[-1].bias.data.fill_(0.25)
     transform = ActionTransformer(policy, np.array([-3.0]), np.array([3.0]))
-    np.testing.assert_allclose(transform(np.zeros((3, 4)), np.array([[-3.0], [0.0], [2.9]])), [[-1.5], [1.5], [3.0]], atol=1e-6)
+    np.testing.assert_allclose(
+        transform(np.zeros((3, 4)), np.array([[-3.0], [0.0], [2.9]])),
+        [[-1.5], [1.5], [3.0]],
+        atol=1e-6,
+    )
 
 
 # --- f_psi --------------------------------------------------------------------------------------------
@@ -133,8 +145,13 @@ def test_the_model_of_the_real_world_comes_nearer_to_it(residual):
         s, a = sim.observe(), rng.uniform(-1, 1, (4, 1)).astype(np.float32)
         predicted, guess = model(s, a)
         truth = real.step(a)[4]["next_obs"]
-        miss.append(((predicted - truth) ** 2).sum(1)), miss_without.append(((sim.peek(a) - truth) ** 2).sum(1))
-        np.testing.assert_array_equal(guess, sim.peek(a).astype(np.float32) if residual else s.astype(np.float32))
+        (
+            miss.append(((predicted - truth) ** 2).sum(1)),
+            miss_without.append(((sim.peek(a) - truth) ** 2).sum(1)),
+        )
+        np.testing.assert_array_equal(
+            guess, sim.peek(a).astype(np.float32) if residual else s.astype(np.float32)
+        )
     assert held_out.shape == (4,) and (held_out > 0).all() and (held_out < 0.5).all()
     assert np.mean(miss) < 0.3 * np.mean(miss_without)
 
@@ -157,7 +174,9 @@ def test_predict_all_goes_through_a_ragged_number_of_rows():
     assert after.shape == tau.s.shape
     one = world("InvertedPendulum-v4", n=1)
     for k in range(11):
-        np.testing.assert_allclose(after[k], one.predict(tau.s[k : k + 1].astype(float), tau.a[k : k + 1])[0], atol=1e-6)
+        np.testing.assert_allclose(
+            after[k], one.predict(tau.s[k : k + 1].astype(float), tau.a[k : k + 1])[0], atol=1e-6
+        )
 
 
 # --- the methods --------------------------------------------------------------------------------------
@@ -165,7 +184,10 @@ def test_predict_all_goes_through_a_ragged_number_of_rows():
 
 def test_no_grounding_is_the_raw_sim():
     grounding = Grounding(world("Hopper-v4"))
-    assert grounding.transformer is identity and grounding.fit(None, 0) == grounding.update(None, 10, 0) == {}
+    assert (
+        grounding.transformer is identity
+        and grounding.fit(None, 0) == grounding.update(None, 10, 0) == {}
+    )
 
 
 def test_ane_adds_noise_of_the_asked_width_to_actions():
@@ -202,7 +224,9 @@ def test_the_units_of_the_reward_are_of_a_real_step_unless_told():
         grounding = RGAT(sim, replace(SMALL, per_step=per_step))
         grounding.fit(tau, 0)
         scales.append(grounding.scale)
-    np.testing.assert_allclose(scales[0], np.sqrt(np.mean((tau.s_next - tau.s) ** 2, axis=0)), rtol=1e-3)
+    np.testing.assert_allclose(
+        scales[0], np.sqrt(np.mean((tau.s_next - tau.s) ** 2, axis=0)), rtol=1e-3
+    )
     np.testing.assert_array_equal(scales[1], np.ones(4))
 
 
@@ -213,7 +237,9 @@ def test_rgat_learns_repeats_and_reloads():
         grounding, policy = RGAT(sim, SMALL), policy_for(sim)
         fitted, rows = grounding.fit(tau, 0), []
         learnt = grounding.update(policy, 256, 0, rows.append)
-        results.append((fitted, learnt, [p.detach().clone() for p in grounding.learner.policy.parameters()]))
+        results.append(
+            (fitted, learnt, [p.detach().clone() for p in grounding.learner.policy.parameters()])
+        )
     assert results[0][:2] == results[1][:2] and len(rows) == 4
     assert all(torch.equal(a, b) for a, b in zip(results[0][2], results[1][2]))
     assert 0 < learnt["kl"] <= SMALL.at.max_kl and 0 < learnt["at_std"]
@@ -271,7 +297,9 @@ def test_one_step_errors_by_hand():
     # each dimension in units of its own real step, then the RMS over dimensions
     steps = ((tau.s_next.astype(float) - tau.s) ** 2).mean(0)
     expected = np.sqrt((np.mean(miss, axis=0) / steps).mean())
-    assert one_step_error(sim, halve, tau) == pytest.approx((expected, np.sqrt(np.mean(change))), rel=1e-3)
+    assert one_step_error(sim, halve, tau) == pytest.approx(
+        (expected, np.sqrt(np.mean(change))), rel=1e-3
+    )
     assert one_step_error(sim, identity, tau)[1] == 0
 
 
@@ -302,8 +330,9 @@ def test_sb3_trains_in_the_grounded_sim(env_id):
 
 def test_sb3_is_told_falls_and_time_limits_apart(monkeypatch):
     pytest.importorskip("stable_baselines3")
-    import envs
     from sb3_adapter import SB3Env
+
+    import envs
 
     monkeypatch.setattr(envs, "TIME_LIMIT", 12)
     env, twin = SB3Env(world("Hopper-v4")), world("Hopper-v4")

@@ -1,11 +1,10 @@
 """The command: every algorithm end to end, a run cut off anywhere and resumed, bad input, replay."""
+
 import csv
 import errno
 import json
-import os
 import resource
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,13 @@ import pytest
 import torch
 from PIL import Image
 
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-sys.path.insert(0, ROOT)
-import runs
+ROOT = str(Path(__file__).resolve().parents[1])
 import train
 import trpo
 from envs import BatchEnv
 from models import GaussianPolicy
 from rgat import METHODS
+from training import run_folder
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -45,7 +43,11 @@ def table(path):
 
 def contents(folder):
     """Every file below a folder, by name, as bytes."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in sorted(Path(folder).rglob("*"))
+        if p.is_file()
+    }
 
 
 def tensors(saved, prefix=""):
@@ -70,7 +72,10 @@ def assert_same_run(ours, theirs):
         a, b = (tensors(torch.load(f / name, weights_only=True)) for f in (ours, theirs))
         assert a.keys() == b.keys()
         for key in a:
-            assert torch.equal(a[key], b[key]) if torch.is_tensor(a[key]) else a[key] == b[key], (name, key)
+            assert torch.equal(a[key], b[key]) if torch.is_tensor(a[key]) else a[key] == b[key], (
+                name,
+                key,
+            )
     for path in theirs.glob("real_*.npz"):
         with np.load(path) as a, np.load(ours / path.name) as b:
             assert all(np.array_equal(a[k], b[k]) for k in ("s", "a", "s_next"))
@@ -101,7 +106,9 @@ def test_every_algorithm_runs_end_to_end(algo, finished):
     rows = table(folder / "progress.csv")
     assert [int(r["grounding_step"]) for r in rows] == [0, 1, 2]
     for row in rows:
-        assert float(row["real_return_deterministic"]) > 0 and float(row["real_return_stochastic"]) > 0
+        assert (
+            float(row["real_return_deterministic"]) > 0 and float(row["real_return_stochastic"]) > 0
+        )
     for row in rows[1:]:
         assert float(row["identity_one_step_error"]) > 0 and float(row["at_one_step_error"]) > 0
     real, sim = ([int(r[k]) for r in rows] for k in ("real_transitions", "sim_steps"))
@@ -135,7 +142,10 @@ def test_step_0_is_the_untouched_sim_policy_and_the_saved_policy_the_best(finish
     sim = train.Settings(env=ENV, seed=3, num_envs=4).completed()
     learner = train.new_learner(sim)
     learner.learn(BatchEnv(ENV, 4), 4096, train.seed_for(3, 0, "pretrain"), freeze_normalizer=False)
-    assert all(torch.equal(v, start["learner"]["policy"][k]) for k, v in learner.policy.state_dict().items())
+    assert all(
+        torch.equal(v, start["learner"]["policy"][k])
+        for k, v in learner.policy.state_dict().items()
+    )
     best = int(np.argmax([float(r["real_return_deterministic"]) for r in rows]))
     acting = torch.load(folder / f"step_{best:02d}.pt", weights_only=True)["acting"]
     policy = torch.load(folder / "policy.pt", weights_only=True)
@@ -146,7 +156,18 @@ def test_step_0_is_the_untouched_sim_policy_and_the_saved_policy_the_best(finish
 
 @pytest.mark.parametrize("env", ["Hopper-v4", "HalfCheetah-v5"])
 def test_the_other_robots_and_the_shallow_policy(env, tmp_path):
-    more = ["--policy", "shallow", "--grounding-steps", "1", "--pretrain-steps", "0", "--policy-steps", "1", "--eval-episodes", "1"]
+    more = [
+        "--policy",
+        "shallow",
+        "--grounding-steps",
+        "1",
+        "--pretrain-steps",
+        "0",
+        "--policy-steps",
+        "1",
+        "--eval-episodes",
+        "1",
+    ]
     if env.startswith("HalfCheetah"):
         more += ["--real-trajectories", "1"]
     assert train.main(command(tmp_path / "run", "rgat", env, *more)) == 0
@@ -160,10 +181,14 @@ def test_pretrained_policies_are_shared(tmp_path, monkeypatch, finished):
     assert len(list((tmp_path / "shared").glob("*.pt"))) == 2
     phases = []
     phase = train.Bar.phase
-    monkeypatch.setattr(train.Bar, "phase", lambda self, step, name: phases.append(name) or phase(self, step, name))
+    monkeypatch.setattr(
+        train.Bar, "phase", lambda self, step, name: phases.append(name) or phase(self, step, name)
+    )
     assert train.main(command(tmp_path / "b", "ane", ENV, *shared)) == 0
     assert "pretrain" not in phases and "reference" not in phases
-    first = lambda folder: {k: v for k, v in table(folder / "progress.csv")[0].items() if k != "seconds"}
+    first = lambda folder: {
+        k: v for k, v in table(folder / "progress.csv")[0].items() if k != "seconds"
+    }
     assert first(tmp_path / "a") == first(tmp_path / "b") == first(finished("sim"))
     # what another version of the learner left there is not taken for this one's
     monkeypatch.setattr(train, "versions", lambda: {"learner": "older"})
@@ -192,7 +217,11 @@ def cut_off_at(monkeypatch, owner, name, count, error):
 
 
 # TRPO updates of the rgat run: 1 pretraining, 2 reference, 3 transformer and 4 policy of step 1, 5 and 6 of step 2
-@pytest.mark.parametrize("algo, update", [("rgat", k) for k in (1, 2, 4, 5, 6)] + [("gat", 4), ("ane", 4), ("oracle", 4), ("physics", 4), ("real", 3)])
+@pytest.mark.parametrize(
+    "algo, update",
+    [("rgat", k) for k in (1, 2, 4, 5, 6)]
+    + [("gat", 4), ("ane", 4), ("oracle", 4), ("physics", 4), ("real", 3)],
+)
 def test_resume_equals_no_interruption(algo, update, tmp_path, finished, monkeypatch):
     folder = tmp_path / "run"
     with monkeypatch.context() as patch:
@@ -210,7 +239,7 @@ def test_resume_equals_no_interruption(algo, update, tmp_path, finished, monkeyp
 def test_a_kill_while_writing_loses_nothing_that_was_whole(write, tmp_path, finished, monkeypatch):
     folder = tmp_path / "run"
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        cut_off_at(patch, runs.os, "replace", write, Killed())
+        cut_off_at(patch, run_folder.os, "replace", write, Killed())
         train.main(command(folder))
     assert train.main(["--resume", str(folder)]) == 0
     assert_same_run(folder, finished("rgat"))
@@ -308,7 +337,7 @@ def test_out_without_space(tmp_path, capsys):
 def test_a_disk_that_fills_up_leaves_whole_steps(write, tmp_path, capfd, finished, monkeypatch):
     folder, full = tmp_path / "run", OSError(errno.ENOSPC, "No space left on device")
     with monkeypatch.context() as patch:
-        cut_off_at(patch, runs.os, "replace", write, full)
+        cut_off_at(patch, run_folder.os, "replace", write, full)
         refused(command(folder), capfd, "No space left", "choose another folder")
     assert not list(folder.glob(".*"))
     assert train.main(["--resume", str(folder)]) == 0
@@ -319,7 +348,11 @@ SETTINGS = {
     "config with a word for a number": ("num_envs", "many"), "config with half a seed": ("seed", 0.5), "config with another algo": ("algo", "sac"),
     "config with another policy": ("policy", "wide"), "config with a number for a change": ("real", 5),
 }  # fmt: skip
-LINES = {"lines in a list": "[1]", "lines of something else": '{"a": 1}', "line without a number": '{"trained on real": "high"}'}
+LINES = {
+    "lines in a list": "[1]",
+    "lines of something else": '{"a": 1}',
+    "line without a number": '{"trained on real": "high"}',
+}
 
 
 def break_run(folder, how):
@@ -329,7 +362,9 @@ def break_run(folder, how):
     elif how == "config of something else":
         (folder / "config.json").write_text('{"name": "web", "version": 2}')
     elif how == "config with foreign settings":
-        (folder / "config.json").write_text('{"settings": {"env": "Hopper-v4", "learning_rate": 0.1}}')
+        (folder / "config.json").write_text(
+            '{"settings": {"env": "Hopper-v4", "learning_rate": 0.1}}'
+        )
     elif how in SETTINGS:
         config = json.loads((folder / "config.json").read_text())
         config["settings"].update([SETTINGS[how]])
@@ -386,7 +421,11 @@ def test_a_broken_or_foreign_run_is_refused_and_left_alone(how, tmp_path, capfd,
 
 
 @pytest.mark.parametrize(
-    "line, says", [(["--out", "runs/b"], "--out cannot be changed"), (["--replay", "runs/b"], "give one of them")]
+    "line, says",
+    [
+        (["--out", "runs/b"], "--out cannot be changed"),
+        (["--replay", "runs/b"], "give one of them"),
+    ],
 )
 def test_requests_that_contradict_themselves(line, says, capfd):
     refused(["--resume", "runs/a", *line], capfd, says)
@@ -405,7 +444,12 @@ def test_a_broken_shared_policy_is_named(tmp_path, capfd, finished):
 
 
 def test_an_unstable_real_world_ends_in_one_line(tmp_path, capfd):
-    refused(command(tmp_path / "run", "rgat", ENV, "--real", "world:gravity=1e12"), capfd, "unstable", "--real")
+    refused(
+        command(tmp_path / "run", "rgat", ENV, "--real", "world:gravity=1e12"),
+        capfd,
+        "unstable",
+        "--real",
+    )
 
 
 def test_help_has_a_line_for_each_setting(capsys):

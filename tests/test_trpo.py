@@ -1,7 +1,6 @@
 """TRPO's pieces against closed forms, plain loops and torch.distributions; the learner on environments with known answers."""
+
 import io
-import os
-import sys
 from concurrent.futures import Future
 from dataclasses import replace
 
@@ -10,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import VectorEnv
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import trpo
 from envs import BatchEnv
 from models import GaussianPolicy, Value
@@ -62,7 +61,9 @@ def test_gae_equals_a_plain_loop(seed, T, gamma, lam):
     ours = gae(reward, value, next_value, terminated, done, gamma, lam)
     for i in range(4):
         column = [x[:, i] for x in (reward, value, next_value, terminated, done)]
-        np.testing.assert_allclose(ours[:, i], plain_gae(*column, gamma, lam), rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(
+            ours[:, i], plain_gae(*column, gamma, lam), rtol=1e-10, atol=1e-12
+        )
 
 
 def test_gae_bootstraps_a_time_limit_and_not_a_fall():
@@ -109,7 +110,12 @@ def kl_hessian(policy, obs):
     shapes = [p.shape for p in policy.parameters()]
 
     def dist(theta):
-        parts = dict(zip(names, (x.reshape(s) for x, s in zip(theta.split([s.numel() for s in shapes]), shapes))))
+        parts = dict(
+            zip(
+                names,
+                (x.reshape(s) for x, s in zip(theta.split([s.numel() for s in shapes]), shapes)),
+            )
+        )
         mean, log_std = torch.func.functional_call(policy, parts, (obs,))
         return torch.distributions.Normal(mean, log_std.exp().expand_as(mean))
 
@@ -140,9 +146,15 @@ def mean_kl_and_log_prob(policy, old_mean, old_log_std, obs, action):
     """KL to the old policy and the new log-probabilities, by torch.distributions in double precision."""
     with torch.no_grad():
         mean, log_std = (x.double() for x in policy(obs))
-    old = torch.distributions.Normal(old_mean.double(), old_log_std.double().exp().expand_as(old_mean))
+    old = torch.distributions.Normal(
+        old_mean.double(), old_log_std.double().exp().expand_as(old_mean)
+    )
     new = torch.distributions.Normal(mean, log_std.exp().expand_as(mean))
-    return torch.distributions.kl_divergence(old, new).sum(1).mean(), new.log_prob(action.double()).sum(1), new.entropy()[0].sum()
+    return (
+        torch.distributions.kl_divergence(old, new).sum(1).mean(),
+        new.log_prob(action.double()).sum(1),
+        new.entropy()[0].sum(),
+    )
 
 
 def advantages(kind, obs, action, g):
@@ -157,14 +169,16 @@ def advantages(kind, obs, action, g):
         "tiny": 1e-30 * noise,
         "one": torch.nn.functional.one_hot(torch.tensor(0), len(obs)).double(),
         "correlated": action[:, 0].double() * 100 + obs[:, 0].double(),
-        "anticorrelated": -action.double().norm(dim=1) ** 4,
+        "anticorrelated": -(action.double().norm(dim=1) ** 4),
         "infinite": noise / (noise.abs() > noise.abs().median()),
         "nan": noise * torch.nan,
     }[kind]
 
 
 KINDS = list(
-    "random,zero,equal,nearly equal,huge,overflowing,tiny,one,correlated,anticorrelated,infinite,nan".split(",")
+    "random,zero,equal,nearly equal,huge,overflowing,tiny,one,correlated,anticorrelated,infinite,nan".split(
+        ","
+    )
 )
 RESTORED = ("no gradient", "no curvature", "exhausted")
 
@@ -182,7 +196,9 @@ RESTORED = ("no gradient", "no curvature", "exhausted")
     hidden=st.sampled_from([(4,), (16, 16)]),
 )
 @settings(max_examples=250, deadline=None, suppress_health_check=list(HealthCheck))
-def test_an_update_keeps_its_promises(seed, kind, n, log_std, max_kl, entropy, damping, scale, backtracks, hidden):
+def test_an_update_keeps_its_promises(
+    seed, kind, n, log_std, max_kl, entropy, damping, scale, backtracks, hidden
+):
     torch.manual_seed(seed)
     g = torch.Generator().manual_seed(seed)
     policy = GaussianPolicy(4, 2, hidden, log_std)
@@ -212,8 +228,14 @@ def test_an_update_keeps_its_promises(seed, kind, n, log_std, max_kl, entropy, d
     # the surrogate once more, in double precision
     spread = advantage.std()
     informative = torch.isfinite(spread) and spread > 1e-9 * advantage.abs().max()
-    A = (advantage - advantage.mean()) / spread if informative else torch.zeros(n, dtype=torch.float64)
-    _, old_log_prob, old_entropy = mean_kl_and_log_prob(_at(policy, before), old_mean, old_log_std, obs, action)
+    A = (
+        (advantage - advantage.mean()) / spread
+        if informative
+        else torch.zeros(n, dtype=torch.float64)
+    )
+    _, old_log_prob, old_entropy = mean_kl_and_log_prob(
+        _at(policy, before), old_mean, old_log_std, obs, action
+    )
     gain = ((log_prob - old_log_prob).exp() * A - A).mean() + entropy * (new_entropy - old_entropy)
     assert gain > -rounding * max(1.0, float(A.abs().max()))
     assert stats["surrogate_gain"] > 0
@@ -249,8 +271,15 @@ def test_the_update_is_the_natural_gradient_step():
     advantage = action[:, 0] - action[:, 1] * obs[:, 0]
     A = (advantage - advantage.mean()) / advantage.std()
     mean, log_std = policy(obs)
-    log_prob = torch.distributions.Normal(mean, log_std.exp().expand_as(mean)).log_prob(action).sum(1)
-    g = torch.cat([x.reshape(-1) for x in torch.autograd.grad((log_prob * A).mean(), list(policy.parameters()))])
+    log_prob = (
+        torch.distributions.Normal(mean, log_std.exp().expand_as(mean)).log_prob(action).sum(1)
+    )
+    g = torch.cat(
+        [
+            x.reshape(-1)
+            for x in torch.autograd.grad((log_prob * A).mean(), list(policy.parameters()))
+        ]
+    )
     F = kl_hessian(policy, obs) + 0.1 * torch.eye(len(g))
     x = torch.linalg.solve(F, g)
     before = flat(policy)
@@ -261,7 +290,9 @@ def test_the_update_is_the_natural_gradient_step():
 
 
 def test_entropy_alone_widens_the_policy():
-    policy, _, stats = one_update(lambda obs, action: torch.zeros(len(obs)), TRPOConfig(entropy=0.1))
+    policy, _, stats = one_update(
+        lambda obs, action: torch.zeros(len(obs)), TRPOConfig(entropy=0.1)
+    )
     assert stats["line_search"] == "accepted" and float(policy.log_std.detach()[0]) > 0
     policy, _, stats = one_update(lambda obs, action: torch.zeros(len(obs)))
     assert stats["line_search"] == "no gradient" and float(policy.log_std.detach()[0]) == 0
@@ -271,12 +302,16 @@ def test_a_line_search_that_finds_nothing_restores_exactly(monkeypatch):
     import trpo
 
     kl = trpo.gaussian_kl
-    monkeypatch.setattr(trpo, "gaussian_kl", lambda *a: kl(*a) + (0 if torch.is_grad_enabled() else 1))
+    monkeypatch.setattr(
+        trpo, "gaussian_kl", lambda *a: kl(*a) + (0 if torch.is_grad_enabled() else 1)
+    )
     torch.manual_seed(0)
     policy, obs = GaussianPolicy(3, 1, (16,)), torch.randn(50, 3)
     before = flat(policy).clone()
     action = policy.act(obs)
-    assert policy_update(policy, obs, action, action[:, 0], TRPOConfig())["line_search"] == "exhausted"
+    assert (
+        policy_update(policy, obs, action, action[:, 0], TRPOConfig())["line_search"] == "exhausted"
+    )
     assert torch.equal(before, flat(policy))
 
 
@@ -324,7 +359,9 @@ def test_advantages_use_the_value_of_the_true_successor():
         ours, successor = v(batch["obs"]), v(batch["next_obs"])
     np.testing.assert_allclose(value, ours, atol=1e-6)
     for i in range(6):
-        column = [x[:, i] for x in (batch["reward"], ours, successor, batch["terminated"], batch["done"])]
+        column = [
+            x[:, i] for x in (batch["reward"], ours, successor, batch["terminated"], batch["done"])
+        ]
         np.testing.assert_allclose(advantage[:, i], plain_gae(*column, 0.9, 0.8), atol=1e-4)
 
 
@@ -379,7 +416,9 @@ def test_a_learner_goes_on_from_its_saved_state():
     other.load(torch.load(file, weights_only=True))
     for one in (learner, other):
         one.learn(env, 512, seed=1)
-    assert torch.equal(flat(learner.policy), flat(other.policy)) and torch.equal(flat(learner.value), flat(other.value))
+    assert torch.equal(flat(learner.policy), flat(other.policy)) and torch.equal(
+        flat(learner.value), flat(other.value)
+    )
     assert all(torch.equal(a, b) for a, b in zip(learner.policy.buffers(), other.policy.buffers()))
 
 
@@ -436,7 +475,9 @@ def test_no_steps_change_nothing():
     env, learner = new_learner("InvertedPendulum-v4", batch_size=256)
     before = flat(learner.policy).clone(), flat(learner.value).clone()
     learner.learn(env, 0, seed=0)
-    assert torch.equal(before[0], flat(learner.policy)) and torch.equal(before[1], flat(learner.value))
+    assert torch.equal(before[0], flat(learner.policy)) and torch.equal(
+        before[1], flat(learner.value)
+    )
 
 
 def test_it_learns_the_pendulum():
@@ -452,7 +493,9 @@ def test_rollouts_are_gymnasiums_episodes(episodes):
     torch.manual_seed(0)
     policy = GaussianPolicy(11, 3)
     policy.net[-1].weight.data.normal_(std=0.3)
-    returns, transitions = rollouts(policy, BatchEnv("Hopper-v4", 2, nthread=1), episodes, seed=5, deterministic=True)
+    returns, transitions = rollouts(
+        policy, BatchEnv("Hopper-v4", 2, nthread=1), episodes, seed=5, deterministic=True
+    )
     assert returns.shape == (episodes,)
     env, expected, count = gymnasium.make("Hopper-v4"), [], 0
     for k in range(episodes):
@@ -479,7 +522,9 @@ def test_rollouts_hand_out_true_successors():
 
 
 def test_transitions_join_and_split():
-    make = lambda n, seed: Transitions(*np.random.default_rng(seed).normal(size=(3, n, 2)).astype(np.float32))
+    make = lambda n, seed: Transitions(
+        *np.random.default_rng(seed).normal(size=(3, n, 2)).astype(np.float32)
+    )
     joined = make(3, 0) + make(4, 1)
     assert len(joined) == 7
     np.testing.assert_array_equal(joined[3:].s_next, make(4, 1).s_next)

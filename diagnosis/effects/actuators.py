@@ -1,0 +1,376 @@
+"""Effects in an actuator: motors, position servos and velocity servos alike."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from diagnosis.effects.base import (
+    BALL,
+    HINGE,
+    HUGE,
+    JOINT_TRANSMISSION,
+    JOINT_TRANSMISSIONS,
+    SLIDE,
+    Effect,
+    Parameter,
+    catalogue,
+    constant_force,
+    explicit_inertia,
+    runge_kutta,
+)
+
+
+class ActuatorEffect(Effect):
+    """An effect on an actuator with one control and an affine force: motors and servos."""
+
+    kinds = ("actuator",)
+
+    def fits(self, model, i):
+        affine = model.actuator_gaintype[i] in (0, 1) and model.actuator_biastype[i] in (0, 1)
+        return affine and model.actuator_ctrlnum[i] == 1 and model.actuator_outnum[i] == 1
+
+    @staticmethod
+    def on_joint(model, i):
+        """Whether it acts on a hinge or slide."""
+        return model.actuator_trntype[i] == JOINT_TRANSMISSION and model.jnt_type[
+            model.actuator_trnid[i, 0]
+        ] in (HINGE, SLIDE)
+
+    @staticmethod
+    def strength(model, i):
+        """A typical force of the actuator."""
+        if model.actuator_forcelimited[i]:
+            return abs(model.actuator_forcerange[i]).max()
+        u = model.actuator_ctrladr[i]
+        if model.actuator_ctrllimited[u]:
+            return abs(model.actuator_gainprm[i, 0]) * abs(model.actuator_ctrlrange[u]).max()
+        return abs(model.actuator_gainprm[i, 0])
+
+    @staticmethod
+    def forces(model, i, recordings):
+        """|force| that the recorded controls asked for, but for velocity feedback."""
+        asked = [
+            model.actuator_gainprm[i, 0] * r.ctrl[:, model.actuator_ctrladr[i]] for r in recordings
+        ]
+        if model.actuator_biasprm[i, 1] and ActuatorEffect.on_joint(model, i):
+            q = model.jnt_qposadr[model.actuator_trnid[i, 0]]
+            k = model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0]
+            asked = [F + k * r.qpos[:, q] for F, r in zip(asked, recordings)]
+        return abs(np.nan_to_num(np.concatenate(asked)))
+
+    @staticmethod
+    def unit(model, i):
+        """Unit of its force."""
+        on_joint = model.actuator_trntype[i] in JOINT_TRANSMISSIONS
+        return (
+            "N·m"
+            if on_joint and model.jnt_type[model.actuator_trnid[i, 0]] in (HINGE, BALL)
+            else "N"
+        )
+
+    @staticmethod
+    def general(spec, model, i):
+        """The spec's actuator, in a notation that can hold any gain and bias."""
+        actuator = spec.actuator(model.actuator(i).name)
+        actuator.type = mujoco.mjtActuator.mjACTUATOR_GENERAL
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        return actuator
+
+
+def refine(spec, longest):
+    """Divide the spec's time step so that it is no longer than `longest`."""
+    spec.option.timestep /= max(1, np.ceil(spec.option.timestep / longest - 1e-9))
+
+
+def set_lag(actuator, seconds, model):
+    """Give a spec's actuator a first-order lag: as of the end of a step, or continuous where the integrator is."""
+    actuator.actdim, actuator.dynprm[0] = 1, seconds
+    actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
+    if runge_kutta(model):
+        actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTER, False
+
+
+@catalogue
+class Gain(ActuatorEffect):
+    """The actuator is stronger or weaker by a ratio, feedback of a servo included."""
+
+    name, simplicity, related = "gain", 0, ("mass", "armature", "viscous_damping", "stiffness")
+    acts_through = "control"
+
+    def parameters(self, model, i):
+        return (Parameter("gain", "1", 1.0, 0.01, 100.0, 0.01),)
+
+    def edit(self, model, i, values):
+        model.actuator_gainprm[i, :3] *= values[0]
+        model.actuator_biasprm[i, :3] *= values[0]
+
+    def write(self, spec, model, i, values):
+        actuator = self.general(spec, model, i)
+        actuator.gainprm[:3] *= values[0]
+        actuator.biasprm[:3] *= values[0]
+        return "mjcf"
+
+
+@catalogue
+class Bias(ActuatorEffect):
+    """A constant actuator force on top."""
+
+    name, related = "bias", ("spring_offset", "gravity")
+
+    def parameters(self, model, i):
+        F = self.strength(model, i)
+        return (Parameter("bias", self.unit(model, i), 0.0, -HUGE * F, HUGE * F, 0.01 * F),)
+
+    def edit(self, model, i, values):
+        model.actuator_biasprm[i, 0] += values[0]
+
+    def write(self, spec, model, i, values):
+        self.general(spec, model, i).biasprm[0] += values[0]
+        return "mjcf"
+
+
+@catalogue
+class BackEmf(ActuatorEffect):
+    """A force −d·(actuator velocity): back-EMF, or the velocity gain of a servo."""
+
+    name, related = "back_emf", ("viscous_damping", "gain", "lag")
+    acts_through = "velocity"
+
+    def parameters(self, model, i):
+        nominal, step = -model.actuator_biasprm[i, 2], 0.01 * self.strength(model, i)
+        if self.on_joint(model, i) and model.actuator_gear[i, 0]:
+            step = (
+                0.02
+                * model.dof_M0[model.jnt_dofadr[model.actuator_trnid[i, 0]]]
+                / model.actuator_gear[i, 0] ** 2
+            )
+        unit = {"N·m": "N·m·s/rad", "N": "N·s/m"}[self.unit(model, i)]
+        return (Parameter("damping", unit, nominal, 0.0, HUGE * step, max(step, 0.01 * nominal)),)
+
+    def edit(self, model, i, values):
+        model.actuator_biasprm[i, 2] = -values[0]
+
+    def write(self, spec, model, i, values):
+        self.general(spec, model, i).biasprm[2] = -values[0]
+        return "mjcf"
+
+
+@catalogue
+class Saturation(ActuatorEffect):
+    """The force is cut off at ± forcerange (of a range that is not symmetric: its larger end)."""
+
+    name, related = "saturation", ("gain",)
+    acts_through = "control"
+
+    def parameters(self, model, i):
+        F = self.strength(model, i)
+        nominal = F if model.actuator_forcelimited[i] else np.inf
+        return (
+            Parameter("forcerange", self.unit(model, i), nominal, 1e-4 * F, HUGE * F, 0.02 * F),
+        )
+
+    def probes(self, model, i, recordings):
+        used = self.forces(model, i, recordings).max()
+        return (
+            used * np.array([[0.9], [0.7], [0.5], [0.3], [0.1]]) if used > 0 else np.zeros((0, 1))
+        )
+
+    @staticmethod
+    def limits(model, i, value):
+        """The range: where there is one already, that in proportion."""
+        nominal = (
+            model.actuator_forcerange[i]
+            if model.actuator_forcelimited[i]
+            else np.array([-1.0, 1.0])
+        )
+        return nominal * value / abs(nominal).max()
+
+    def edit(self, model, i, values):
+        model.actuator_forcerange[i] = self.limits(model, i, values[0])
+        model.actuator_forcelimited[i] = True
+
+    def write(self, spec, model, i, values):
+        actuator = spec.actuator(model.actuator(i).name)
+        actuator.forcelimited, actuator.forcerange = (
+            mujoco.mjtLimited.mjLIMITED_TRUE,
+            self.limits(model, i, values[0]),
+        )
+        return "mjcf"
+
+
+@catalogue
+class Lag(ActuatorEffect):
+    """The command passes a first-order filter."""
+
+    name, related = "lag", ("delay", "back_emf", "time_step")
+    acts_through = "control"
+
+    def fits(self, model, i):
+        return super().fits(model, i) and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
+
+    def parameters(self, model, i):
+        return (
+            Parameter("seconds", "s", 0.0, 0.0, 5.0, max(0.001, model.opt.timestep)),
+        )  # less is lost within a step
+
+    def command(self, signal, model, i, values):
+        return replace(signal, lag=values[0])
+
+    def write(self, spec, model, i, values):
+        set_lag(self.general(spec, model, i), values[0], model)
+        if runge_kutta(model):  # explodes on a filter faster than a step
+            refine(spec, values[0])
+        return "mjcf"
+
+
+@catalogue
+class Delay(ActuatorEffect):
+    """The command acts later, by any fraction of a time step."""
+
+    name, simplicity, related = "delay", 0, ("lag", "sensor_delay", "time_step")
+    acts_through = "control"
+
+    def parameters(self, model, i):
+        return (Parameter("seconds", "s", nominal_delay(model, i), 0.0, 1.0, 0.001),)
+
+    def command(self, signal, model, i, values):
+        return replace(signal, delay=values[0])
+
+    def write(self, spec, model, i, values):
+        """MuJoCo reads its history as of each force evaluation, but only what was there before the step."""
+        seconds, actuator, step = (
+            values[0],
+            spec.actuator(model.actuator(i).name),
+            spec.option.timestep,
+        )
+        actuator.delay, actuator.nsample = 0.0, 0
+        if not seconds:
+            return "mjcf"
+        if runge_kutta(model):  # evaluates half a step later on average, a whole one at the last
+            refine(spec, seconds / 1.5)
+            seconds += spec.option.timestep / 2
+        elif seconds < step and actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
+            # a finer step would change everything: spread the command over later steps, as late on average
+            set_lag(self.general(spec, model, i), step / np.log1p(step / seconds), model)
+            return "mjcf"
+        else:
+            refine(spec, seconds)
+        actuator.delay, actuator.interp = seconds, 1
+        return "mjcf"
+
+
+def nominal_delay(model, i):
+    """Seconds by which the nominal model delays actuator i: MuJoCo rounds a part of a step up to one."""
+    return max(model.actuator_delay[i], model.opt.timestep) if model.actuator_delay[i] > 0 else 0.0
+
+
+@catalogue
+class DeadZone(ActuatorEffect):
+    """Nothing happens below a threshold: of the control (motor) or of the force (servo)."""
+
+    name, simplicity, amplitudes, related = "dead_zone", 2, 1, ("coulomb_friction", "gain")
+    acts_through = "control"
+
+    def fits(self, model, i):
+        motor = model.actuator_gainprm[i, 0] and not self._servo(model, i)
+        return super().fits(model, i) and (
+            motor
+            or self.on_joint(model, i)
+            and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
+        )
+
+    @staticmethod
+    def _servo(model, i):
+        return model.actuator_biasprm[i, 1:3].any()
+
+    def parameters(self, model, i):
+        F = self.strength(model, i)
+        if self._servo(model, i):
+            return (Parameter("half_width", self.unit(model, i), 0.0, 0.0, HUGE * F, 0.005 * F),)
+        u = F / abs(model.actuator_gainprm[i, 0])
+        return (Parameter("half_width", "control", 0.0, 0.0, HUGE * u, 0.01 * u),)
+
+    def probes(self, model, i, recordings):
+        used = np.quantile(self.forces(model, i, recordings), 0.9)
+        unit = 1.0 if self._servo(model, i) else abs(model.actuator_gainprm[i, 0])
+        return used / unit * np.array([[0.03], [0.1], [0.3]]) if used > 0 else np.zeros((0, 1))
+
+    def command(self, signal, model, i, values):
+        if self._servo(model, i):
+            return signal
+        return replace(
+            signal, value=np.sign(signal.value) * np.maximum(abs(signal.value) - values[0], 0.0)
+        )
+
+    def force(self, models, i, values):
+        model = models[0]
+        if not self._servo(model, i):
+            return None
+        gain = np.array([m.actuator_gainprm[i, 0] for m in models])
+        bias = np.array([m.actuator_biasprm[i, :3] for m in models])
+        limit = np.array(
+            [
+                abs(m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else (np.inf, np.inf)
+                for m in models
+            ]
+        )
+        joint, u, gear = (
+            model.actuator_trnid[i, 0],
+            model.actuator_ctrladr[i],
+            model.actuator_gear[i, 0],
+        )
+        q, d = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+
+        def absorbed(qpos, qvel, ctrl, time):
+            length, velocity = gear * qpos[:, q], gear * qvel[:, d]
+            F = gain * ctrl[:, u] + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * velocity
+            out = np.zeros_like(qvel)
+            out[:, d] = -gear * np.clip(
+                np.clip(F, -limit[:, 0], limit[:, 1]), -values[:, 0], values[:, 0]
+            )
+            return out
+
+        return absorbed
+
+    def write(self, spec, model, i, values):
+        """For a motor on a joint: it turns a light wheel against a spring of its own instead, and a tendon whose
+        spring has a dead band hands on what is beyond it, about half a time step later, once it is wound up."""
+        motor = spec.actuator(model.actuator(i).name)
+        plain = not motor.biasprm[1:3].any() and motor.dyntype == mujoco.mjtDyn.mjDYN_NONE
+        if not (self.on_joint(model, i) and plain):
+            return "none"
+        explicit_inertia(spec, model)  # a total mass would count the wheel
+        h, gain, gear, joint = (
+            spec.option.timestep,
+            abs(motor.gainprm[0]),
+            motor.gear[0],
+            motor.target,
+        )
+        name = f"dead_zone:{motor.name}"
+        k = 1e-3 * self.strength(
+            model, i
+        )  # so soft that it travels far, and the joint's own travel adds nothing
+        inertia = max(0.5 * k * h**2, 1e-13)  # MuJoCo refuses less than 1e-15
+        # heavy for its inertia, that is too dense for air to matter
+        body = spec.worldbody.add_body(
+            name=name, mass=1.0, ipos=[0.0] * 3, inertia=[inertia] * 3, explicitinertial=True
+        )
+        wheel = body.add_joint(
+            name=name, type=mujoco.mjtJoint.mjJNT_HINGE, limited=mujoco.mjtLimited.mjLIMITED_FALSE
+        )
+        wheel.armature = wheel.frictionloss = wheel.ref = wheel.springref = (
+            0.0  # whatever the defaults say
+        )
+        wheel.stiffness, wheel.damping = [k, 0.0, 0.0], [k * h, 0.0, 0.0]
+        edge = gain * values[0] / k
+        tendon = spec.add_tendon(name=name, stiffness=[k, 0.0, 0.0], springlength=[-edge, edge])
+        tendon.wrap_joint(name, 1.0)
+        tendon.wrap_joint(joint, -2 * gear)
+        motor.target, motor.gear = name, [1.0, *motor.gear[1:]]
+        if motor.biasprm[0]:  # stays outside
+            constant_force(spec, f"{name}:bias", gear * motor.biasprm[0], JOINT_TRANSMISSION, joint)
+            motor.biasprm[0] = 0.0
+        if any(motor.forcerange):
+            motor.forcerange = np.array(motor.forcerange) + gain * values[0] * np.array([-1, 1])
+        return "mjcf"

@@ -1,0 +1,302 @@
+"""What an effect is: a place, parameters, and the ways it can change a simulation.
+
+An effect acts in one or more ways, each a method of Effect that does nothing
+unless a class overrides it:
+
+    edit      fields of the compiled model         build    parts edit() sizes
+    command   the control on its way               push     a constant force
+    force     a force that depends on the state    measure  the sensor
+    write     the same in MJCF                     probes   values worth a try
+    suited    steps for the motion recorded        far      values to try at full size
+
+Values are absolute, in SI units, with the sign of the MJCF field. A new effect
+is one class with the decorator @catalogue, and no other line.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+HINGE, SLIDE, BALL = (
+    int(kind)
+    for kind in (
+        mujoco.mjtJoint.mjJNT_HINGE,
+        mujoco.mjtJoint.mjJNT_SLIDE,
+        mujoco.mjtJoint.mjJNT_BALL,
+    )
+)
+JOINT_TRANSMISSION = int(mujoco.mjtTrn.mjTRN_JOINT)
+JOINT_TRANSMISSIONS = JOINT_TRANSMISSION, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+HUGE = 1e6  # upper bound where physics gives none, in units of the effect's own scale
+EFFECTS = []  # the catalogue, one instance of each class; effects are applied in this order
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an effect sits: kind is joint, actuator, body, geom, sensor or world."""
+
+    kind: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    `step` is a small typical change, for sensitivities; values outside
+    [low, high] are not physical. nominal is infinite for a limit that the
+    nominal model does not have.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    low: float
+    high: float
+    step: float
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect at a place, perhaps only under a condition. Hashable; equal if these are.
+
+    when: None, or {'recording': name, 'time': [from, to]}, in that recording's time.
+    """
+
+    effect: "Effect"
+    place: Place
+    parameters: tuple
+    when: dict = None
+
+    def _key(self):
+        return self.effect, self.place, repr(self.when)
+
+    def __eq__(self, other):
+        return isinstance(other, Candidate) and self._key() == other._key()
+
+    def __hash__(self):
+        return hash((self.effect.name, self.place))
+
+    def __repr__(self):
+        return f"{self.effect.name}({self.place.name})" + (
+            f" when {self.when}" if self.when else ""
+        )
+
+    @property
+    def nominal(self):
+        return tuple(p.nominal for p in self.parameters)
+
+
+class Effect:
+    """One kind of physics; an id is always that of the model it is passed with."""
+
+    name = ""
+    kinds = ()  # kinds of place; one instance for each, with the attribute `kind`
+    constants = False  # edit() changes something that mj_setConst derives constants from
+    acts_through = ""  # what its force varies with: velocity, position, control or contact
+    timed = False  # differs from a simpler effect only under a condition
+    amplitudes = (
+        0  # of an effect with probes: how many of its first parameters it acts in proportion to
+    )
+    together = 1  # of an effect with probes: how many in a row are tried as one
+    simplicity = 1  # 0 for the first things to think of, up to 3
+    related = ()  # names of effects at the same joint in whose wrong value this one may hide
+
+    def __repr__(self):
+        return self.name
+
+    def places(self, model):
+        """Names of the objects of model where this effect can sit."""
+        if self.kind == "world":
+            return ["world"] if self.fits(model, 0) else []
+        count = {
+            "body": model.nbody,
+            "joint": model.njnt,
+            "geom": model.ngeom,
+            "actuator": model.nactuator,
+            "sensor": model.nsensor,
+        }[self.kind]
+        return [getattr(model, self.kind)(i).name for i in range(count) if self.fits(model, i)]
+
+    def id(self, model, name):
+        """Id of the object of that name in model."""
+        if self.kind == "world":
+            return 0
+        return mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{self.kind.upper()}"), name)
+
+    def fits(self, model, i):
+        """Whether the effect can sit at object i."""
+        return True
+
+    def parameters(self, model, i):
+        """Tuple of Parameter for object i."""
+        raise NotImplementedError
+
+    def probes(self, model, i, recordings):
+        """Values (P, parameters) to try first: by default each parameter a step up, and down where it may."""
+        parameters = self.parameters(model, i)
+        nominal = [p.nominal for p in parameters]
+        rows = [
+            nominal[:k] + [p.nominal + d] + nominal[k + 1 :]
+            for k, p in enumerate(parameters)
+            for d in (p.step, -p.step)
+            if p.low <= p.nominal + d <= p.high
+        ]
+        return np.array(rows)
+
+    def merged(self, rows, amounts):
+        """(values, amount): the one probe, and how much of it, that does what these probes in these amounts do."""
+        return rows[0], amounts[0]
+
+    def far(self, model, i, recordings):
+        """Values (P, parameters) to try besides a small step: so far off an effect no longer acts in proportion."""
+        return ()
+
+    def suited(self, parameters, model, i, recordings):
+        """The parameters with steps and bounds that suit the recorded motion."""
+        return parameters
+
+    def possible(self, values, nominal):
+        """Whether a real machine can have these values, and not another effect by this name."""
+        return True
+
+    def canonical(self, values):
+        """The same effect in its usual numbers, where several sets of values mean the same."""
+        return values
+
+    def build(self, spec, model, i):
+        """Add to spec (of the nominal model) what edit() sizes."""
+
+    def edit(self, model, i, values):
+        """Put the effect into a compiled model."""
+
+    def command(self, signal, model, i, values):
+        """The Signal that reaches the actuator."""
+        return signal
+
+    def push(self, qfrc, xfrc, model, i, values):
+        """Add a constant force to qfrc (nv,) or xfrc (nbody, 6)."""
+
+    def force(self, models, i, values):
+        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,)) -> force to add, (S,nv).
+
+        models: S compiled models with every edit made; values (S, parameters).
+        """
+        return None
+
+    def measure(self, values):
+        """(offset, ratio, delay) of the sensor."""
+        return 0.0, 1.0, 0.0
+
+    def write(self, spec, model, i, values):
+        """Put the effect into spec, of the nominal model; return 'mjcf', 'measurement' or 'none'."""
+        raise NotImplementedError
+
+    def overrides(self, method):
+        """Whether the effect acts by this method."""
+        return getattr(type(self), method) is not getattr(Effect, method)
+
+
+def catalogue(cls):
+    """Class decorator: the effect joins EFFECTS, once for each kind of place."""
+    for kind in cls.kinds:
+        instance = cls()
+        instance.kind = kind
+        EFFECTS.append(instance)
+    return cls
+
+
+def turns(model, j):
+    """Whether joint j is a hinge."""
+    return model.jnt_type[j] == HINGE
+
+
+def runge_kutta(model):
+    """Whether forces are evaluated several times in a step."""
+    return model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)
+
+
+def displace(spec, kind, name, by):
+    """Move a spec's "body" or "geom" by a vector (3,) in the axes of its body, whatever <frame>s it stands in."""
+    find = lambda within: getattr(within, kind)(name)
+    element, turn = find(spec), np.eye(3)
+    if element.frame is not None:
+
+        def compiled(move):
+            other = spec.copy()
+            find(other).pos += move
+            return find(other.compile()).pos
+
+        turn = np.stack([compiled(axis) - compiled(0 * axis) for axis in np.eye(3)])
+    ends = kind == "geom" and not np.isnan(element.fromto[0])
+    if ends:
+        element.fromto += np.tile(turn @ by, 2)
+    else:
+        element.pos += turn @ by
+
+
+def explicit_inertia(spec, model):
+    """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot be edited."""
+    compiler, on = spec.compiler, mujoco.mjtInertiaFromGeom
+    # even over what the file says
+    implied = compiler.inertiafromgeom == on.mjINERTIAFROMGEOM_TRUE or compiler.settotalmass > 0
+    compiler.inertiafromgeom, compiler.settotalmass, compiler.balanceinertia = (
+        on.mjINERTIAFROMGEOM_AUTO,
+        -1,
+        False,
+    )
+    for body in spec.bodies[1:]:
+        i, explicit = (
+            model.body(body.name).id,
+            body.explicitinertial and not np.isfinite(body.fullinertia[0]),
+        )
+        if (implied or not explicit) and model.body_mass[i] > 0:
+            body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
+            body.mass, body.ipos, body.inertia = (
+                model.body_mass[i],
+                model.body_ipos[i],
+                model.body_inertia[i],
+            )
+            body.ialt.type, body.iquat = (
+                mujoco.mjtOrientation.mjORIENTATION_QUAT,
+                model.body_iquat[i],
+            )
+
+
+def angle(spec, model, j, value):
+    """A position of a new joint like joint j as the spec writes it."""
+    return np.rad2deg(value) if spec.compiler.degree and turns(model, j) else value
+
+
+def authored(spec, model, j, value):
+    """A position of joint j as the spec writes it. What was attached from another file keeps that file's units, and stands in a frame."""
+    if not (turns(model, j) and spec.frames):
+        return angle(spec, model, j, value)
+    other, name = spec.copy(), model.joint(j).name
+    joint = other.joint(name)
+    joint.ref, joint.limited = (
+        1.0,
+        mujoco.mjtLimited.mjLIMITED_FALSE,
+    )  # its range may be half written
+    return value / other.compile().joint(name).qpos0[0]
+
+
+def passive(spec, name, trntype, target, **block):
+    """Add a dcmotor with neither inputs nor electrics: a carrier of cogging and friction, without a control."""
+    motor = spec.add_actuator(name=name, trntype=trntype, target=target)
+    motor.forcelimited = motor.ctrllimited = (
+        mujoco.mjtLimited.mjLIMITED_FALSE
+    )  # whatever the defaults say
+    motor.set_to_dcmotor(
+        motorconst=[0.0, 0.0],
+        resistance=1.0,
+        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_NONE),
+        **block,
+    )
+    return motor
+
+
+def constant_force(spec, name, value, trntype, target):
+    """Add a constant force along a transmission: cogging with no poles."""
+    return passive(spec, name, trntype, target, cogging=[value, 0.0, np.pi / 2])

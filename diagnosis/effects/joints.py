@@ -1,0 +1,512 @@
+"""Effects in a joint: a hinge or slide, some in a ball joint too. Their scales follow the joint's own inertia."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from diagnosis.effects.base import (
+    BALL,
+    HINGE,
+    HUGE,
+    JOINT_TRANSMISSION,
+    SLIDE,
+    Effect,
+    Parameter,
+    angle,
+    authored,
+    catalogue,
+    constant_force,
+    passive,
+    runge_kutta,
+    turns,
+)
+
+# frictionloss as a nearly rigid constraint: with MuJoCo's default a stuck joint creeps
+SOLREF_FRICTION = (0.004, 1.0)
+SOLIMP_FRICTION = (0.999, 0.9999, 0.001, 0.5, 2.0)
+STRENGTHS = (
+    1.0,
+    10.0,
+    100.0,
+)  # of a force that grows faster than in proportion, over what turns the fastest motion round
+FALLS = 0.05  # share by which friction at rest is larger than that of motion, at least, that it is called Stribeck's
+DISSIPATION = ("viscous_damping", "coulomb_friction", "quadratic_damping", "back_emf")
+
+
+class JointEffect(Effect):
+    """An effect on a joint, of the types given."""
+
+    kinds = ("joint",)
+    types = HINGE, SLIDE
+
+    def fits(self, model, i):
+        return model.jnt_type[i] in self.types
+
+    @staticmethod
+    def driven(model, i):
+        """Whether an actuator acts on the joint itself."""
+        return (
+            (model.actuator_trntype == JOINT_TRANSMISSION) & (model.actuator_trnid[:, 0] == i)
+        ).any()
+
+    @staticmethod
+    def unit(model, i, hinge, slide):
+        return slide if model.jnt_type[i] == SLIDE else hinge
+
+    @staticmethod
+    def scale(model, i):
+        """Inertia the joint moves in the reference pose."""
+        return model.dof_M0[model.jnt_dofadr[i]]
+
+    @staticmethod
+    def travel(model, i, recordings):
+        """All recorded positions and speeds of the joint, speeds by differences."""
+        q = model.jnt_qposadr[i]
+        known = [
+            np.isfinite(r.qpos[:, q]) for r in recordings
+        ]  # between measured rows, be they next to each other or not
+        speed = [np.diff(r.qpos[k, q]) / np.diff(r.time[k]) for r, k in zip(recordings, known)]
+        return np.concatenate([r.qpos[k, q] for r, k in zip(recordings, known)]), abs(
+            np.concatenate(speed)
+        )
+
+    def reach(self, model, i, recordings):
+        """How far from its spring's rest, and how fast, the joint was recorded, but for the odd row."""
+        position, speed = self.travel(model, i, recordings)
+        far = abs(position - model.qpos_spring[model.jnt_qposadr[i]])
+        return [
+            float(max(np.quantile(x, 0.99, method="lower"), 1e-3)) if len(x) else 1.0
+            for x in (far, speed)
+        ]
+
+
+class JointNumber(JointEffect):
+    """An effect that is one number of the joint, in the compiled model and in the spec."""
+
+    number = "", "", ""  # name; unit for a hinge, for a slide
+    compiled = "", None  # field of the model by dof (or jnt_*, by joint); column, if it has several
+    authored = "", None  # attribute of the spec's joint; its component, if it has several
+    step, signed = 0.02, False
+
+    def _field(self, model, i):
+        name, column = self.compiled
+        rows = i if name.startswith("jnt") else self._dofs(model, i)
+        return getattr(model, name), rows if column is None else (rows, column)
+
+    @staticmethod
+    def _dofs(model, i):
+        first = model.jnt_dofadr[i]
+        return slice(first, first + (3 if model.jnt_type[i] == BALL else 1))
+
+    def parameters(self, model, i):
+        (name, *units), (field, k), M = self.number, self._field(model, i), self.scale(model, i)
+        low, nominal = -HUGE * M if self.signed else 0.0, np.ravel(field[k])[0]
+        step = max(self.step * M, 0.01 * abs(nominal))
+        return (Parameter(name, self.unit(model, i, *units), nominal, low, HUGE * M, step),)
+
+    @staticmethod
+    def scaled(parameter, size):
+        """The parameter with a step and bounds that are the usual forces where it acts `size` times as much as at one."""
+        p = parameter
+        return replace(
+            p,
+            step=max(p.step / size, 0.01 * abs(p.nominal)),
+            low=min(p.low, p.low / size),
+            high=max(p.high, p.high / size),
+        )
+
+    def edit(self, model, i, values):
+        field, k = self._field(model, i)
+        field[k] = values[0]
+
+    def write(self, spec, model, i, values):
+        joint, (attribute, component) = spec.joint(model.joint(i).name), self.authored
+        if component is None:
+            setattr(joint, attribute, values[0])
+        else:
+            getattr(joint, attribute)[component] = values[0]
+        return "mjcf"
+
+
+@catalogue
+class Armature(JointNumber):
+    """Inertia of rotor and gears, in the joint's own coordinate."""
+
+    name, types, constants, related = "armature", (HINGE, SLIDE, BALL), True, ("mass", "gain")
+    number, compiled, authored, step = (
+        ("armature", "kg·m²", "kg"),
+        ("dof_armature", None),
+        ("armature", None),
+        0.01,
+    )
+
+
+@catalogue
+class ViscousDamping(JointNumber):
+    """Force −d·v."""
+
+    name, types, simplicity, related = "viscous_damping", (HINGE, SLIDE, BALL), 0, DISSIPATION
+    acts_through = "velocity"
+    number, compiled, authored = (
+        ("damping", "N·m·s/rad", "N·s/m"),
+        ("dof_damping", None),
+        ("damping", 0),
+    )
+
+
+@catalogue
+class QuadraticDamping(JointNumber):
+    """Force −d·v·|v|."""
+
+    name, related = "quadratic_damping", DISSIPATION
+    acts_through = "velocity"
+    number, compiled, authored = (
+        ("damping2", "N·m·s²/rad²", "N·s²/m²"),
+        ("dof_dampingpoly", 0),
+        ("damping", 1),
+    )
+
+    def suited(self, parameters, model, i, recordings):
+        return (self.scaled(parameters[0], self.reach(model, i, recordings)[1]),)
+
+    def far(self, model, i, recordings):
+        farthest, _ = self.reach(model, i, recordings)
+        return [(strength * self.scale(model, i) / farthest,) for strength in STRENGTHS]
+
+
+@catalogue
+class CoulombFriction(JointNumber):
+    """Dry friction, which holds the joint below its limit."""
+
+    name, types, simplicity, related = "coulomb_friction", (HINGE, SLIDE, BALL), 0, DISSIPATION
+    acts_through = "velocity"
+    number, compiled, authored = (
+        ("frictionloss", "N·m", "N"),
+        ("dof_frictionloss", None),
+        ("frictionloss", None),
+    )
+    step = 0.05
+
+    def edit(self, model, i, values):
+        dofs = self._dofs(model, i)
+        if not model.dof_frictionloss[dofs].any():  # else the nominal model's own softness counts
+            model.dof_solref[dofs], model.dof_solimp[dofs] = SOLREF_FRICTION, SOLIMP_FRICTION
+        super().edit(model, i, values)
+
+    def write(self, spec, model, i, values):
+        joint = spec.joint(model.joint(i).name)
+        if not joint.frictionloss:
+            joint.solref_friction, joint.solimp_friction = SOLREF_FRICTION, SOLIMP_FRICTION
+        return super().write(spec, model, i, values)
+
+
+@catalogue
+class Stiffness(JointNumber):
+    """Force −k·(q − springref)."""
+
+    name, related = "stiffness", ("spring_offset", "nonlinear_stiffness", "gain")
+    acts_through = "position"
+    number, compiled, authored, step = (
+        ("stiffness", "N·m/rad", "N/m"),
+        ("jnt_stiffness", None),
+        ("stiffness", 0),
+        0.1,
+    )
+
+
+@catalogue
+class NonlinearStiffness(JointNumber):
+    """Force −k·(q − springref)³."""
+
+    name, simplicity, related = "nonlinear_stiffness", 2, ("stiffness", "spring_offset")
+    acts_through = "position"
+    number, compiled, authored = (
+        ("stiffness3", "N·m/rad³", "N/m³"),
+        ("jnt_stiffnesspoly", 1),
+        ("stiffness", 2),
+    )
+    step, signed = 0.1, True
+
+    def suited(self, parameters, model, i, recordings):
+        return (self.scaled(parameters[0], self.reach(model, i, recordings)[0] ** 2),)
+
+    def far(self, model, i, recordings):
+        farthest, fastest = self.reach(model, i, recordings)
+        return [
+            (strength * self.scale(model, i) * fastest**2 / farthest**4,) for strength in STRENGTHS
+        ]
+
+
+@catalogue
+class StribeckFriction(JointEffect):
+    """Dry friction that falls from `static` at rest to `coulomb` when moving faster than `velocity`.
+
+    |F| = coulomb + (static − coulomb) exp(−(v/velocity)²): here as frictionloss `static` and
+    a force that gives back what it is too much once moving; in MJCF with LuGre bristles.
+    """
+
+    name, simplicity, related, amplitudes = "stribeck_friction", 3, DISSIPATION, 2
+    acts_through = "velocity"
+
+    def parameters(self, model, i):
+        M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
+        return (
+            Parameter("coulomb", force, 0.0, 0.0, HUGE * M, 0.05 * M),
+            Parameter("static", force, 0.0, 0.0, HUGE * M, 0.05 * M),
+            Parameter("velocity", self.unit(model, i, "rad/s", "m/s"), 0.1, 1e-4, 100.0, 0.01),
+        )
+
+    def suited(self, parameters, model, i, recordings):
+        """It has fallen at the speeds that are reached: what still falls there is another law of friction."""
+        coulomb, static, velocity = parameters
+        _, speed = self.travel(model, i, recordings)
+        return (
+            coulomb,
+            static,
+            replace(
+                velocity,
+                high=max(
+                    velocity.nominal, np.quantile(speed, 0.5) + 1e-4, 0.5 * np.quantile(speed, 0.98)
+                ),
+            ),
+        )
+
+    def probes(self, model, i, recordings):
+        step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
+        slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
+        return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
+
+    def possible(self, values, nominal):
+        """It falls with speed, by enough to matter."""
+        return values[1] > (1 + FALLS) * values[0]
+
+    def edit(self, model, i, values):
+        CoulombFriction().edit(model, i, values[1:2])
+
+    def force(self, models, i, values):
+        d = models[0].jnt_dofadr[i]
+        coulomb, static, velocity = values.T
+
+        def released(qpos, qvel, ctrl, time):
+            v, out = qvel[:, d], np.zeros_like(qvel)
+            out[:, d] = (coulomb - static) * np.expm1(-((v / velocity) ** 2)) * np.sign(v)
+            return out
+
+        return released
+
+    def write(self, spec, model, i, values):
+        # bristles as stiff as the time step can carry
+        joint, h, (coulomb, static, velocity) = model.joint(i).name, spec.option.timestep, values
+        M = (
+            1 / model.dof_invweight0[model.jnt_dofadr[i]]
+        )  # what the joint feels, its neighbours free
+        if static == coulomb:
+            return CoulombFriction().write(spec, model, i, (coulomb,))
+        # they carry what falls off and a share of the rest, frictionloss what is left
+        share = (0.05 if runge_kutta(model) else 1e-3) * (static - coulomb)
+        share = min(share, coulomb) if share > 0 else coulomb
+        stiffness, damping = 0.1 * M / h**2, 0.0
+        if runge_kutta(model):  # also explodes where they relax within a step
+            stiffness = min(0.1 * stiffness, share / (h * max(3.0, 10 * velocity)))
+            damping = np.sqrt(stiffness * M)
+        CoulombFriction().write(spec, model, i, (coulomb - share,))
+        lugre = [stiffness, damping, share, static - coulomb + share, velocity]
+        passive(spec, f"stribeck_friction:{joint}", JOINT_TRANSMISSION, joint, lugre=lugre)
+        return "mjcf"
+
+
+@catalogue
+class SpringOffset(JointEffect):
+    """A constant force in the joint: a spring at rest elsewhere, a tilt, a cable."""
+
+    name, related = "spring_offset", ("stiffness", "bias", "coulomb_friction")
+
+    def parameters(self, model, i):
+        M = self.scale(model, i)
+        return (
+            Parameter(
+                "torque", self.unit(model, i, "N·m", "N"), 0.0, -HUGE * M, HUGE * M, 0.05 * M
+            ),
+        )
+
+    def push(self, qfrc, xfrc, model, i, values):
+        qfrc[model.jnt_dofadr[i]] += values[0]
+
+    def write(self, spec, model, i, values):
+        joint = spec.joint(model.joint(i).name)
+        k = joint.stiffness
+        if k[0] > 0 and not k[1] and not k[2]:
+            joint.springref = joint.springref + authored(spec, model, i, values[0] / k[0])
+        else:
+            constant_force(
+                spec, f"spring_offset:{joint.name}", values[0], JOINT_TRANSMISSION, joint.name
+            )
+        return "mjcf"
+
+
+@catalogue
+class Cogging(JointEffect):
+    """Force amplitude·sin(poles·q + phase), as of a motor's magnets."""
+
+    name, simplicity, amplitudes, together = "cogging", 3, 1, 2
+    acts_through = "position"
+
+    def fits(self, model, i):
+        return super().fits(model, i) and self.driven(model, i)
+
+    def parameters(self, model, i):
+        M = self.scale(model, i)
+        return (
+            Parameter(
+                "amplitude", self.unit(model, i, "N·m", "N"), 0.0, -HUGE * M, HUGE * M, 0.05 * M
+            ),
+            Parameter("poles", self.unit(model, i, "1", "rad/m"), 6.0, 0.1, 1e6, 0.1),
+            Parameter("phase", "rad", 0.0, -10.0, 10.0, 0.1),
+        )
+
+    def suited(self, parameters, model, i, recordings):
+        """At least one whole wave within the recorded travel: less is only a bent spring."""
+        amplitude, poles, phase = parameters
+        travel = np.ptp(self.travel(model, i, recordings)[0])
+        return (
+            amplitude,
+            replace(poles, low=min(max(poles.low, 2 * np.pi / max(travel, 1e-9)), poles.high)),
+            phase,
+        )
+
+    def probes(self, model, i, recordings):
+        """Ripples close enough to each other for one of them to stay in step over the whole travel."""
+        position, _ = self.travel(model, i, recordings)
+        travel = np.ptp(np.quantile(position, [0.05, 0.95])) + 1e-6
+        if turns(model, i) and travel > 5:
+            poles = np.arange(1, 25)
+        else:
+            poles = np.arange(6.5, 80.0, 3.0) / travel
+        farthest, fastest = self.reach(model, i, recordings)
+        amplitude = max(0.05, 0.1 * fastest**2 / farthest) * self.scale(
+            model, i
+        )  # too little does not show beside dry friction
+        return np.array([(amplitude, n, phase) for n in poles for phase in (0.0, np.pi / 2)])
+
+    def merged(self, rows, amounts):
+        wave = sum(amount * row[0] * np.exp(1j * row[2]) for row, amount in zip(rows, amounts))
+        return (rows[0][0], rows[0][1], float(np.angle(wave))), abs(wave) / rows[0][0]
+
+    def canonical(self, values):
+        amplitude, poles, phase = values
+        return abs(amplitude), poles, (phase + np.pi * (amplitude < 0)) % (2 * np.pi)
+
+    def _motor(self, model, i):
+        return f"cogging:{model.joint(i).name}"
+
+    def build(self, spec, model, i):
+        self.write(spec, model, i, (1.0, 1.0, 0.0))
+
+    def edit(self, model, i, values):
+        model.actuator_biasprm[model.actuator(self._motor(model, i)).id, :3] = values
+
+    def write(self, spec, model, i, values):
+        passive(
+            spec,
+            self._motor(model, i),
+            JOINT_TRANSMISSION,
+            model.joint(i).name,
+            cogging=list(values),
+        )
+        return "mjcf"
+
+
+@catalogue
+class JointStop(JointEffect):
+    """The joint is limited to [low, high]."""
+
+    name, simplicity = "joint_stop", 2
+    acts_through = "position"
+    NEVER = 1e6  # a bound that is never met
+
+    def parameters(self, model, i):
+        low, high = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
+        unit = self.unit(model, i, "rad", "m")
+        return (
+            Parameter("low", unit, low, -self.NEVER, self.NEVER, 0.01),
+            Parameter("high", unit, high, -self.NEVER, self.NEVER, -0.01),
+        )
+
+    def probes(self, model, i, recordings):
+        position, _ = self.travel(model, i, recordings)
+        low, high = (p.nominal for p in self.parameters(model, i))
+        a, b, c, d = np.quantile(position, [0.03, 0.15, 0.85, 0.97])
+        both = [(x, y) for x, y in ((a, d), (b, c)) if x > low and y < high]
+        return np.array(
+            [(x, high) for x in (a, b) if x > low] + [(low, x) for x in (c, d) if x < high] + both
+        ).reshape(-1, 2)
+
+    def edit(self, model, i, values):
+        model.jnt_limited[i] = True
+        model.jnt_range[i] = self._range(values)
+
+    def _range(self, values):
+        low, high = np.clip(values, -self.NEVER, self.NEVER)
+        return low, max(high, low + 1e-6)  # MuJoCo compiles no other
+
+    def write(self, spec, model, i, values):
+        joint = spec.joint(model.joint(i).name)
+        joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+        joint.range = [authored(spec, model, i, x) for x in self._range(values)]
+        return "mjcf"
+
+
+@catalogue
+class Backlash(JointEffect):
+    """Play of width `gap` between motor and load; the sensor sits at the motor.
+
+    The recorded joint becomes the motor's; a second one in the same body, limited
+    to ± gap/2 and in the middle at the start of a run, carries the load. The motor side
+    needs inertia of its own: without armature it gets one per cent of the joint's.
+    """
+
+    name, simplicity, amplitudes = "backlash", 3, 1
+    acts_through = "position"
+
+    def fits(self, model, i):
+        body = model.jnt_bodyid[i]
+        last = model.body_jntadr[body] + model.body_jntnum[body] - 1 == i
+        return super().fits(model, i) and last and self.driven(model, i)
+
+    def parameters(self, model, i):
+        return (Parameter("gap", self.unit(model, i, "rad", "m"), 0.0, 0.0, 1.0, 0.005),)
+
+    def probes(self, model, i, recordings):
+        position, _ = self.travel(model, i, recordings)
+        return np.ptp(position) * np.array([[0.01], [0.04]])
+
+    def build(self, spec, model, i):
+        motor = spec.joint(model.joint(i).name)
+        motor.armature = max(motor.armature, 0.01 * self.scale(model, i))
+        load = motor.parent.add_joint(
+            name=f"backlash:{motor.name}",
+            type=motor.type,
+            pos=model.jnt_pos[i],
+            axis=model.jnt_axis[i],
+        )
+        load.armature = load.frictionloss = load.ref = load.springref = load.margin = 0.0
+        load.damping, load.stiffness = [0.0] * 3, [0.0] * 3
+        load.limited, load.range = (
+            mujoco.mjtLimited.mjLIMITED_TRUE,
+            [angle(spec, model, i, x) for x in (-0.5, 0.5)],
+        )
+        load.solref_limit, load.solimp_limit = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
+        return load
+
+    def edit(self, model, i, values):
+        model.jnt_range[model.joint(f"backlash:{model.joint(i).name}").id] = (
+            -values[0] / 2,
+            values[0] / 2,
+        )
+
+    def write(self, spec, model, i, values):
+        self.build(spec, model, i).range = [
+            angle(spec, model, i, x) for x in (-values[0] / 2, values[0] / 2)
+        ]
+        return "mjcf"

@@ -1,0 +1,200 @@
+"""What a corrected simulator predicts: the reported error before, after and at the floor, its curve, and traces.
+
+    before = prediction_error(world, {}, recordings, noise)        # nominal
+    after = prediction_error(world, settings, recordings, noise)
+
+The error is the contract's (windows.error): consecutive windows, start as recorded, in units of the noise.
+"""
+
+import numpy as np
+
+from diagnosis.estimation import initial_states, residuals
+from diagnosis.estimation import windows as cut
+
+DRAWS = 4  # of noise, for what a perfect simulator would miss
+
+
+def predict(world, settings, windows, begun=None):
+    """qpos (W, T, nq) and qvel (W, T, nv) of every window from its recorded start, or from the given ones."""
+    qpos, qvel = cut.recorded_starts(world.model, windows) if begun is None else begun
+    return world.simulate([settings] * len(windows), qpos, qvel, windows)
+
+
+def consecutive(recordings, horizon):
+    return [w for r in recordings for w in cut.consecutive(r, horizon, r.start)]
+
+
+def prediction_error(world, settings, recordings, noise):
+    """(error over all channels in noises, {channel: error in SI})."""
+    windows = consecutive(recordings, cut.HORIZON)
+    return cut.error(world.model, windows, predict(world, settings, windows)[0], noise)
+
+
+def floor_error(world, settings, recordings, position_noise, velocity_noise):
+    """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}), and how far the square of the
+    former scatters between recordings of the same motion, noise being what it is (a standard deviation)."""
+    gap = floor_gaps(world, settings, recordings, position_noise, velocity_noise)[:, 1:]
+    known = np.isfinite(gap)
+    square = np.where(known, gap**2, 0.0)
+    per_channel = {
+        name: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
+        for name, dofs in cut.channels(world.model).items()
+        if known[..., dofs].any()
+    }
+    noise = reporting_noise(position_noise)
+    total, count = (square / noise**2).sum((1, 2)).reshape(DRAWS, -1), max(known.sum(), 1)
+    scatter = (
+        np.sqrt(total.var(axis=0, ddof=1).sum()) * DRAWS / count
+    )  # windows are independent of each other
+    return float(np.sqrt(total.sum() / count)), per_channel, float(scatter)
+
+
+def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON):
+    """What a perfect simulator would miss in the windows, or some of many: (DRAWS W, T, nv), NaN where nothing was measured.
+
+    The corrected model from start states fitted to the first 0.3 s, from one row before each window on, stands for the
+    truth. It is measured anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
+    by differences; DRAWS times, for noise alone makes this vary.
+    """
+    rng, model = np.random.default_rng(0), world.model
+    windows = sparse(consecutive(recordings, horizon))
+    early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
+    ends = [
+        int(
+            np.searchsorted(
+                w.recording.time, w.recording.time[w.first] + cut.HORIZON * (1 + 1e-6), "right"
+            )
+        )
+        - 1
+        for w in windows
+    ]
+    begun = [w._replace(last=max(min(w.last, end), w.first + 1)) for w, end in zip(early, ends)]
+    problem = residuals.Problem(world, begun, position_noise, velocity_noise)
+    fit = initial_states.fit(problem, residuals.Hypothesis(tuple(settings.items())), sharp=False)
+    truth, speed = predict(world, settings, early, (fit.qpos, fit.qvel))
+    finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
+    every, at = (
+        np.arange(len(windows)),
+        np.array([w.first - e.first for w, e in zip(windows, early)]),
+    )
+    seconds = np.array(
+        [w.recording.time[w.first + 1] - w.recording.time[e.first] for w, e in zip(windows, early)]
+    )
+    known = np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows)))
+    measured = np.array([np.isfinite(w.recording.qvel[w.first]) for w in windows])
+    spread, out = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0), []
+    for _ in range(DRAWS):
+        noisy = cut.integrate(model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,)))
+        start = cut.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds[:, None]
+        start = np.where(measured, speed[every, at] + spread * rng.normal(size=start.shape), start)
+        predicted = predict(world, settings, windows, (noisy[every, at], start))[0]
+        rows = np.minimum(np.arange(predicted.shape[1]) + at[:, None], noisy.shape[1] - 1)
+        out.append(
+            np.where(known, cut.difference(model, predicted, noisy[every[:, None], rows]), np.nan)
+        )
+    return np.concatenate(out)
+
+
+def reporting_noise(position_noise):
+    """Noise to divide by, (nv,): finite and positive everywhere."""
+    return np.where(np.isfinite(position_noise), np.maximum(position_noise, 1e-12), 1.0)
+
+
+def curve(
+    world, settings, recordings, position_noise, velocity_noise, longest=3 * cut.HORIZON, points=15
+):
+    """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t up to `longest`.
+
+    Windows in which a prediction blew up before t are left out of its error there and counted, with all that were measured
+    then: "blown_up": {"before":, "after":, "of":}, where there are any.
+    """
+    noise = reporting_noise(position_noise)
+    windows = consecutive(recordings, longest)
+    seconds = [w.recording.time[w.first : w.last + 1] - w.recording.time[w.first] for w in windows]
+    sample = np.median([s[-1] / (len(s) - 1) for s in seconds])
+    most = max(1, round(max(s[-1] for s in seconds) / sample))
+    measured = cut.measured(windows)
+    known = np.isfinite(cut.difference(world.model, measured, measured))
+    predicted = {
+        name: predict(world, s, windows)[0] for name, s in (("before", {}), ("after", settings))
+    }
+    gaps = {
+        name: cut.position_residual(world.model, windows, qpos) for name, qpos in predicted.items()
+    }
+    gaps["floor"] = floor_gaps(world, settings, recordings, position_noise, velocity_noise, longest)
+    out = []
+    for time in sample * np.unique(np.linspace(1, most, min(points, most)).round()):
+        rows = np.array(
+            [_row_at(s, time) for s in seconds]
+        )  # recordings may be sampled at different rates
+        measured_then = _at(known, rows)
+        entry = {"seconds": float(time)}
+        blown = {
+            name: int((measured_then & ~np.isfinite(_at(gaps[name], rows))).any(1).sum())
+            for name in predicted
+        }
+        if any(blown.values()):
+            entry["blown_up"] = {**blown, "of": int(measured_then.any(1).sum())}
+        with np.errstate(invalid="ignore", over="ignore"):
+            entry |= {name: _rms(_at(gaps[name], rows) / noise) for name in predicted}
+            entry["floor"] = _rms(_at(gaps["floor"], np.tile(sparse(rows), DRAWS)) / noise)
+        out.append(entry)
+    return out
+
+
+def _row_at(seconds, time):
+    """The row of a window that stands nearest to a time after its start; -1 where the window has ended by then."""
+    row = int(np.argmin(np.abs(seconds - time)))
+    return row if row and np.abs(seconds[row] - time) <= 0.51 * np.diff(seconds).max() else -1
+
+
+def _at(values, rows):
+    """(W, T, nv) at one row of every window, of those that have it: (V, nv)."""
+    having = np.flatnonzero((rows >= 0) & (rows < values.shape[1]))
+    return values[having, rows[having]]
+
+
+def sparse(windows, most=300):
+    """Every one of a list, or every second, third ... of a long one."""
+    return windows[:: -(-len(windows) // most)]
+
+
+def _rms(x):
+    x = x[np.isfinite(x)]
+    return float(np.sqrt(np.mean(x**2))) if len(x) else None
+
+
+def traces(world, settings, recordings):
+    """[{recording, channel, time, measured, nominal, corrected}] of some held-out recordings; predictions break (NaN) at window starts."""
+    out, model = [], world.model
+    for recording in recordings[:3]:
+        windows = cut.consecutive(recording, cut.HORIZON, recording.start)
+        lines = [_stitched(predict(world, s, windows)[0], windows) for s in ({}, settings)]
+        rows = np.concatenate([np.arange(w.first, w.last + 1) for w in windows])
+        for j, _, q, _ in cut.joint_slices(model):
+            for i in range(q.start, q.stop):
+                if not np.isfinite(recording.qpos[:, i]).any():
+                    continue
+                name = (
+                    "qpos:"
+                    + cut.joint_name(model, j)
+                    + (f":{i - q.start}" if q.stop - q.start > 1 else "")
+                )
+                out.append(
+                    {
+                        "recording": recording.name,
+                        "channel": name,
+                        "time": recording.time[rows],
+                        "measured": recording.qpos[rows, i],
+                        "nominal": lines[0][:, i],
+                        "corrected": lines[1][:, i],
+                    }
+                )
+    return out
+
+
+def _stitched(qpos, windows):
+    pieces = [qpos[i, : w.last - w.first + 1].copy() for i, w in enumerate(windows)]
+    for piece in pieces:
+        piece[0] = np.nan
+    return np.concatenate(pieces)

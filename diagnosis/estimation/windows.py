@@ -1,0 +1,291 @@
+"""Recordings cut into windows: start states, noise, residuals and the error that everybody reports.
+
+    windows = consecutive(recording, horizon=0.3)
+    start_qpos, start_qvel = recorded_starts(model, windows)
+    qpos, qvel = world.simulate(settings, start_qpos, start_qvel, windows)
+    rms, per_channel = error(model, windows, qpos, noise)
+
+A window is (recording, first row, last row), both rows inside. Position differences live in the
+tangent space of the joints (nv numbers), so that quaternions need no special case further up.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+
+from diagnosis.simulation.simulator import Window
+
+HORIZON = 0.3  # s, of the error that is reported
+ENDLESS = 1e100  # m or rad: whoever is farther off is nowhere
+
+# ---- joint coordinates -------------------------------------------------------------------------
+
+
+def _quat_multiply(a, b):
+    w, x, y, z = np.moveaxis(a, -1, 0)
+    p, q, r, s = np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            w * p - x * q - y * r - z * s,
+            w * q + x * p + y * s - z * r,
+            w * r - x * s + y * p + z * q,
+            w * s + x * r - y * q + z * p,
+        ],
+        -1,
+    )
+
+
+def _rotation_vector(quat):
+    """(..., 4) unit quaternions -> (..., 3) rotation vectors of at most half a turn."""
+    quat = np.where(quat[..., :1] < 0, -quat, quat)
+    sine = np.linalg.norm(quat[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quat[..., :1])
+    return quat[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+
+
+def _quat_of(vector):
+    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(angle / 2), vector * 0.5 * np.sinc(angle / (2 * np.pi))], -1)
+
+
+def joint_slices(model):
+    """(joint id, type, qpos slice, dof slice) for every joint."""
+    sizes = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+    for j in range(model.njnt):
+        kind = mujoco.mjtJoint(model.jnt_type[j])
+        nq, nv = sizes.get(kind, (1, 1))
+        q, v = model.jnt_qposadr[j], model.jnt_dofadr[j]
+        yield j, kind, slice(q, q + nq), slice(v, v + nv)
+
+
+def difference(model, start, end):
+    """end - start in the tangent space: (..., nq), (..., nq) -> (..., nv), as mj_differentiatePos with dt = 1."""
+    out = np.empty(np.broadcast_shapes(start.shape, end.shape)[:-1] + (model.nv,))
+    for _, kind, q, v in joint_slices(model):
+        a, b = start[..., q], end[..., q]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            out[..., v.start : v.start + 3] = b[..., :3] - a[..., :3]
+            a, b, v = a[..., 3:], b[..., 3:], slice(v.start + 3, v.stop)
+        elif kind != mujoco.mjtJoint.mjJNT_BALL:
+            out[..., v] = b - a
+            continue
+        out[..., v] = _rotation_vector(_quat_multiply(a * np.array([1.0, -1, -1, -1]), b))
+    return out
+
+
+def integrate(model, qpos, step):
+    """qpos + step, step in the tangent space: (..., nq), (..., nv) -> (..., nq)."""
+    out = np.empty(np.broadcast_shapes(qpos.shape[:-1], step.shape[:-1]) + (model.nq,))
+    for _, kind, q, v in joint_slices(model):
+        a, d = qpos[..., q], step[..., v]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            out[..., q.start : q.start + 3] = a[..., :3] + d[..., :3]
+            a, d, q = a[..., 3:], d[..., 3:], slice(q.start + 3, q.stop)
+        elif kind != mujoco.mjtJoint.mjJNT_BALL:
+            out[..., q] = a + d
+            continue
+        quat = _quat_multiply(a, _quat_of(d))
+        out[..., q] = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+    return out
+
+
+def recordings_of(windows):
+    """The recordings that windows were cut from, each once."""
+    return list(dict.fromkeys(w.recording for w in windows))
+
+
+def sampling(recordings):
+    """Usual time between the rows of recordings, s."""
+    return np.median([np.median(np.diff(r.time)) for r in recordings])
+
+
+def evenly(number, most):
+    """At most so many of 0 .. number - 1, evenly spread: indices, ascending."""
+    return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(int))
+
+
+def joint_name(model, joint):
+    return model.joint(joint).name or str(joint)
+
+
+def channels(model):
+    """{channel name: dofs}: one per hinge and slide, ":pos" and ":rot" for a free joint."""
+    out = {}
+    for j, kind, _, v in joint_slices(model):
+        name = "qpos:" + joint_name(model, j)
+        dofs = np.arange(v.start, v.stop)
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            out[name + ":pos"], out[name + ":rot"] = dofs[:3], dofs[3:]
+        else:
+            out[name] = dofs
+    return out
+
+
+# ---- states ------------------------------------------------------------------------------------
+
+
+def _filled(time, column, default):
+    good = np.isfinite(column)
+    return np.interp(time, time[good], column[good]) if good.any() else np.full(len(time), default)
+
+
+def states(model, recording):
+    """Recorded states without holes: qpos (T, nq), qvel (T, nv).
+
+    qpos as recorded; qvel as measured, else by central difference. What was never measured is made up: positions
+    by summing measured velocities from the model's qpos0, else qpos0 and rest.
+    """
+    time = recording.time
+    qpos, qvel = np.array(recording.qpos, float), np.array(recording.qvel, float)
+    for _, kind, q, v in joint_slices(model):
+        rotation = kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+        quat = qpos[:, q.stop - 4 : q.stop] if rotation else None
+        if rotation:  # q and -q are one: between holes too
+            known = np.flatnonzero(np.isfinite(quat).all(1))
+            quat[known[1:]] *= np.where(
+                np.cumsum((quat[known[1:]] * quat[known[:-1]]).sum(1) < 0) % 2, -1.0, 1.0
+            )[:, None]
+        for i in range(q.start, q.stop):
+            if np.isfinite(qpos[:, i]).any() or rotation:
+                qpos[:, i] = _filled(time, qpos[:, i], model.qpos0[i])
+            else:
+                speed = _filled(time, qvel[:, v.start], 0.0)
+                qpos[:, i] = model.qpos0[i] + np.concatenate(
+                    [[0], np.cumsum(speed[:-1] * np.diff(time))]
+                )
+        if rotation:
+            quat /= np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), 1e-9)
+    before = np.maximum(np.arange(len(time)) - 1, 0)
+    after = np.minimum(np.arange(len(time)) + 1, len(time) - 1)
+    central = difference(model, qpos[before], qpos[after]) / (time[after] - time[before])[:, None]
+    return qpos, np.where(np.isfinite(qvel), qvel, central)
+
+
+def consecutive(recording, horizon=HORIZON, first=0, end=None):
+    """Windows of horizon seconds end to end (one's last row is the next one's first); an incomplete last one is dropped.
+
+    first, end: rows of the stretch to cut, end not included. A stretch shorter than the horizon is one window.
+    """
+    time, out = recording.time[:end], []
+    sample, start = np.median(np.diff(recording.time)), first
+    while first < len(time) - 1:
+        last = int(np.searchsorted(time, time[first] + horizon + 0.01 * sample, side="right")) - 1
+        last = max(last, first + 1)
+        if time[-1] < time[first] + horizon - 0.5 * sample:
+            break
+        out.append(Window(recording, first, last))
+        first = last
+    return out or [Window(recording, start, len(time) - 1)]
+
+
+def recorded_starts(model, windows):
+    """Start states as the error defines them: qpos (W, nq), qvel (W, nv)."""
+    known = {r: states(model, r) for r in recordings_of(windows)}
+    pick = [(known[w.recording], w.first) for w in windows]
+    return np.array([s[0][i] for s, i in pick]), np.array([s[1][i] for s, i in pick])
+
+
+def measured(windows, field="qpos"):
+    """The recorded rows of every window, (W, T, n), padded with NaN to the longest."""
+    length = max(w.last - w.first + 1 for w in windows)
+    width = getattr(windows[0].recording, field).shape[1]
+    out = np.full((len(windows), length, width), np.nan)
+    for i, w in enumerate(windows):
+        rows = getattr(w.recording, field)[w.first : w.last + 1]
+        out[i, : len(rows)] = rows
+    return out
+
+
+def position_residual(model, windows, qpos):
+    """measured - predicted in the tangent space, (W, T, nv); NaN where nothing was measured."""
+    return difference(model, qpos, measured(windows))
+
+
+def gaps(model, windows, qpos):
+    """Measured less predicted (W, T - 1, nv), 0 where nothing was measured, and where something was; what the reported error sums.
+
+    Row 0 of a window is the start and does not count. A prediction that blew up counts as infinite.
+    """
+    residual, rows = position_residual(model, windows, qpos)[:, 1:], measured(windows)[:, 1:]
+    known = np.isfinite(difference(model, rows, rows))
+    return np.where(known, np.where(abs(residual) < ENDLESS, residual, np.inf), 0.0), known
+
+
+def error(model, windows, qpos, noise):
+    """The reported error of predictions qpos (W, T, nq): over all channels (in noises), and per channel (SI).
+
+    noise (nv,).
+    """
+    gap, known = gaps(model, windows, qpos)
+    square = gap**2
+    per_channel = {}
+    for name, dofs in channels(model).items():
+        if known[..., dofs].any():
+            per_channel[name] = float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
+    return float(np.sqrt((square / noise**2).sum() / max(known.sum(), 1))), per_channel
+
+
+# ---- noise -------------------------------------------------------------------------------------
+
+
+def difference_noise(column):
+    """Noise (standard deviation) of one column from its d-th differences, d = 2..6.
+
+    Differences annihilate a smooth motion and keep white noise; a quantile keeps impacts and standstill out. Where
+    the estimate still falls with d the noise is not white (filtered before it was stored): then coarser rows count.
+    Of a reading that mostly stands still it is the rounding to its smallest step; inf where it never moves.
+    """
+    column = column[np.isfinite(column)]
+    best = np.inf
+    for stride in (1, 2, 4):
+        estimates = []
+        for order in range(2, 7):
+            d = np.diff(column[::stride], order)
+            if len(d) < 5:
+                break
+            gain = np.sqrt(math.comb(2 * order, order))
+            estimates.append(np.quantile(np.abs(d), 0.8) / 1.2816 / gain)
+        if not estimates:
+            break
+        best = min(estimates)
+        if len(estimates) < 5 or estimates[-1] > 0.6 * estimates[1]:
+            break
+    if best == 0:
+        step = np.abs(np.diff(column))
+        best = step[step > 0].min(initial=np.inf) / np.sqrt(12)
+    return best
+
+
+def measurement_noise(model, recordings):
+    """First guess of each dof's position and velocity noise, (nv,), (nv,); inf where nothing was measured."""
+    position, velocity = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
+    for dof in range(model.nv):
+        p, v = [], []
+        for recording in recordings:
+            column = _tangent_column(model, recording, dof)
+            p.append(difference_noise(column))
+            v.append(difference_noise(recording.qvel[:, dof]))
+        for noise, found in ((position, p), (velocity, v)):  # of the recordings that measured it
+            found = np.array(found)[np.isfinite(found)]
+            noise[dof] = np.median(found) if len(found) else np.inf
+    for name, dofs in channels(model).items():  # components of one channel share their noise
+        position[dofs] = pooled(position[dofs])
+    return position, velocity
+
+
+def pooled(noise):
+    """The noise of a channel, from those of its components that moved; inf where none did."""
+    finite = noise[np.isfinite(noise)]
+    return np.sqrt(np.mean(finite**2)) if len(finite) else np.inf
+
+
+def _tangent_column(model, recording, dof):
+    for _, kind, q, v in joint_slices(model):
+        if v.start <= dof < v.stop:
+            if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+                return recording.qpos[:, q.start]
+            if kind == mujoco.mjtJoint.mjJNT_FREE and dof < v.start + 3:
+                return recording.qpos[:, q.start + dof - v.start]
+            known = recording.qpos[np.isfinite(recording.qpos[:, q.stop - 4 : q.stop]).all(1)]
+            return np.cumsum(difference(model, known[:-1], known[1:])[:, dof])

@@ -1,0 +1,281 @@
+"""The model's own sensors beside the joints': what was recorded of them against what MuJoCo computes from the predicted state.
+
+    errors(world, settings, held_out)                                          # {sensor: before, after, noise, unit}
+    faults(world, settings, train, position_noise, velocity_noise)             # findings: a bias, scale or delay of one
+
+Nothing is fitted to them but their own faults, and those only where one explains nearly all that the corrected model leaves,
+of sensors of motion: forces are the model's own, and where they differ it may be the model that is wrong.
+"""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from diagnosis.effects.base import SLIDE
+from diagnosis.estimation import cluster_scores, initial_states, prediction_error, residuals
+from diagnosis.estimation import windows as cut
+from diagnosis.selection import transients
+
+LEVEL = 1e-3  # false-alarm rate, shared between all sensors and faults
+EXPLAINED = 0.8  # of what lies above a sensor's noise, the share that its fault must explain
+LATE = 0.1  # s, of a window, before which a late sensor would read what was before it
+SAME = 0.05  # errors closer than this cannot be told apart
+MOTION = "rad", "rad/s", "rad/s²", "m", "m/s", "m/s²"
+UNITS = {
+    "rad": "JOINTPOS",
+    "rad/s": "JOINTVEL GYRO BALLANGVEL FRAMEANGVEL",
+    "rad/s²": "FRAMEANGACC",
+    "m": "TENDONPOS FRAMEPOS RANGEFINDER SUBTREECOM GEOMDIST",
+    "m/s": "TENDONVEL VELOCIMETER FRAMELINVEL SUBTREELINVEL",
+    "m/s²": "ACCELEROMETER FRAMELINACC",
+    "N": "TOUCH FORCE",
+    "N·m": "TORQUE",
+    "T": "MAGNETOMETER",
+    "J": "E_POTENTIAL E_KINETIC",
+}
+
+
+class Tried(NamedTuple):
+    """A sensor's fault at a value, and sums over each of the clusters of windows (C,)."""
+
+    candidate: object
+    value: float
+    gram: np.ndarray  # of the slope of the sensor's reading with the value
+    score: np.ndarray  # of that slope times what is left
+    left: np.ndarray  # squares of what it leaves of the measurements
+    bare: np.ndarray  # squares of what no fault leaves
+    rows: int
+
+
+def recorded(model, recordings):
+    """[(name, columns of sensordata)] of the sensors that any of the recordings measured."""
+    out = []
+    for i in range(model.nsensor):
+        name, at = model.sensor(i).name or str(i), model.sensor_adr[i]
+        if any(np.isfinite(r.sensors[name]).any() for r in recordings if name in r.sensors):
+            out.append((name, slice(at, at + model.sensor_dim[i])))
+    return out
+
+
+def unit(model, name):
+    """The SI unit of a sensor, "" where it has none or it depends on what it is at."""
+    i = model.sensor(name).id
+    kind = mujoco.mjtSensor(model.sensor_type[i])
+    if (
+        kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL)
+        and model.jnt_type[model.sensor_objid[i]] == SLIDE
+    ):
+        return "m" if kind == mujoco.mjtSensor.mjSENS_JOINTPOS else "m/s"
+    return next(
+        (u for u, kinds in UNITS.items() if kind.name.removeprefix("mjSENS_") in kinds.split()), ""
+    )
+
+
+def turns(model, name):
+    """Whether a sensor gives quaternions."""
+    return model.sensor_type[model.sensor(name).id] in (
+        int(mujoco.mjtSensor.mjSENS_BALLQUAT),
+        int(mujoco.mjtSensor.mjSENS_FRAMEQUAT),
+    )
+
+
+def measured(windows, name, width):
+    """(W, T, width) recorded rows of a sensor; NaN where there are none, and at the last, whose control belongs to what follows."""
+    out = np.full((len(windows), max(w.last - w.first + 1 for w in windows), width), np.nan)
+    for i, w in enumerate(windows):
+        if name in w.recording.sensors:
+            rows = w.recording.sensors[name][w.first : w.last]
+            out[i, : len(rows)] = rows
+    return out
+
+
+def noise_of(recordings, name):
+    """Usual noise of a sensor's columns."""
+    return float(
+        np.median(
+            [
+                cut.difference_noise(column)
+                for r in recordings
+                if name in r.sensors
+                for column in r.sensors[name].T
+            ]
+        )
+    )
+
+
+def errors(world, settings, recordings):
+    """{sensor: {"before", "after", "noise": RMS over windows as of the reported error, "unit"}}; infinite where it blows up."""
+    known, windows, out = (
+        recorded(world.model, recordings),
+        prediction_error.consecutive(recordings, cut.HORIZON),
+        {},
+    )
+    begun = cut.recorded_starts(world.model, windows) if known else None
+    predicted = (
+        {
+            k: world.simulate([s] * len(windows), *begun, windows, sensors=True)[2]
+            for k, s in (("before", {}), ("after", settings))
+        }
+        if known
+        else {}
+    )
+    for name, columns in known:
+        seen = measured(windows, name, columns.stop - columns.start)[:, 1:]
+        here = np.isfinite(seen)
+        at_hand = {
+            k: np.where(np.isfinite(p[:, 1:, columns]), p[:, 1:, columns], np.inf)
+            for k, p in predicted.items()
+        }
+        if turns(world.model, name):  # q and -q are the same rotation
+            at_hand = {
+                k: np.where((p * seen).sum(-1, keepdims=True) < 0, -p, p)
+                for k, p in at_hand.items()
+            }
+        gaps = {k: p[here] - seen[here] for k, p in at_hand.items()}
+        if here.any():
+            out[name] = {
+                **{k: float(np.sqrt(np.mean(gap**2))) for k, gap in gaps.items()},
+                "noise": noise_of(recordings, name),
+                "unit": unit(world.model, name),
+            }
+    return out
+
+
+def faults(world, settings, train, position_noise, velocity_noise, event=None, most=100):
+    """[finding] for every sensor of which a bias, a scale or a delay explains nearly all that the corrected model leaves.
+
+    event: of the recordings, in whose time nothing is looked for, or None."""
+    known, out = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION], []
+    if not known:
+        return out
+    windows = [
+        w
+        for r in train
+        for first, end in transients.quiet(r, event)
+        for w in cut.consecutive(r, cut.HORIZON, first, end)
+    ]
+    windows = windows[:: -(-len(windows) // most)]
+    fit = initial_states.fit(
+        residuals.Problem(world, windows, position_noise, velocity_noise),
+        residuals.Hypothesis(tuple(settings.items())),
+        sharp=False,
+    )
+    labels, early = (
+        cluster_scores.clusters(windows),
+        np.zeros(measured(windows, "", 1).shape[:2], bool),
+    )
+    for i, w in enumerate(windows):
+        early[
+            i, : np.searchsorted(w.recording.time, w.recording.time[w.first] + LATE) - w.first
+        ] = True
+    predict = lambda more: world.simulate(
+        [{**settings, **more}] * len(windows), fit.qpos, fit.qvel, windows, sensors=True
+    )[2]
+    plain, tried = predict({}), {}
+    for effect in (
+        "sensor_bias",
+        "sensor_scale",
+        "sensor_delay",
+    ):  # of all sensors at once: none acts on another
+        candidates = {
+            c.place.name: c
+            for c in world.candidates
+            if c.effect.name == effect and c.place.kind == "sensor"
+        }
+        values = {name: candidates[name].nominal[0] for name, _ in known}
+        for _ in range(4):
+            now = predict({candidates[n]: (v,) for n, v in values.items()})
+            moved = predict(
+                {candidates[n]: (v + candidates[n].parameters[0].step,) for n, v in values.items()}
+            )
+            for name, columns in known:
+                p, target = (
+                    candidates[name].parameters[0],
+                    measured(windows, name, columns.stop - columns.start),
+                )
+                slope = (moved[..., columns] - now[..., columns]) / p.step
+                left, bare = target - now[..., columns], target - plain[..., columns]
+                here = (
+                    np.isfinite(left) & np.isfinite(slope) & np.isfinite(bare) & ~early[..., None]
+                )
+                total = lambda x: cluster_scores.summed(labels, np.where(here, x, 0.0).sum((1, 2)))
+                gram, score = total(slope**2), total(slope * left)
+                tried[name, effect] = Tried(
+                    candidates[name],
+                    values[name],
+                    gram,
+                    score,
+                    total(left**2),
+                    total(bare**2),
+                    here.sum(),
+                )
+                values[name] = float(
+                    np.clip(values[name] + score.sum() / max(gram.sum(), 1e-300), p.low, p.high)
+                )
+    for name, columns in known:
+        mine = sorted((t for (n, _), t in tried.items() if n == name), key=lambda t: t.left.sum())
+        found = [finding(world.model, t, noise_of(train, name), len(tried)) for t in mine]
+        if found[0]:
+            same = [
+                f
+                for f, t in zip(found[1:], mine[1:])
+                if f and t.left.sum() < (1 + SAME) ** 2 * mine[0].left.sum()
+            ]
+            rivals = [
+                {
+                    "effect": f["effect"],
+                    "place": f["place"],
+                    "parameters": [
+                        {k: p[k] for k in ("name", "nominal", "value", "unit")}
+                        for p in f["parameters"]
+                    ],
+                }
+                for f in same
+            ]
+            out.append({**found[0], "also_possible": rivals})
+    return out
+
+
+def finding(model, tried, noise, tests):
+    """The finding of a sensor's fault, or None where it is not sure enough. tests: how many faults were tried in all."""
+    name, p, gram = tried.candidate.place.name, tried.candidate.parameters[0], tried.gram
+    left, bare = tried.left.sum(), tried.bare.sum()
+    if len(gram) < 3 or not bare - left > EXPLAINED * max(bare - tried.rows * noise**2, 0.2 * bare):
+        return None
+    whole = tried.score + gram * (
+        tried.value - p.nominal
+    )  # as seen from the sound sensor, its slope taken as here
+    move, _, chance, held = cluster_scores.wald(gram[:, None, None], whole[:, None])
+    if chance * tests > LEVEL or held.sum() <= 0:
+        return None
+    half = cluster_scores.t_quantile(len(gram) - 1) * float(
+        np.sqrt(cluster_scores.sandwich(gram[:, None, None], whole[:, None], move)[0, 0])
+    )
+    low, high = tried.value - half, tried.value + half
+    if low <= p.nominal <= high:
+        return None
+    size = unit(model, name) if p.unit == "sensor" else p.unit
+    return {
+        "effect": tried.candidate.effect.name,
+        "place": {"kind": "sensor", "name": name},
+        "parameters": [
+            {
+                "name": p.name,
+                "nominal": float(p.nominal),
+                "value": tried.value,
+                "unit": size,
+                "low": max(low, p.low),
+                "high": min(high, p.high),
+            }
+        ],
+        "evidence": {
+            "held_out_error_removed": 0.0,
+            "sensor_error_removed": float(1 - np.sqrt(left / bare)),
+            "p_value": min(chance * tests, 1.0),
+        },
+        "depends_on": [],
+        "when": None,
+        "written_as": "measurement",
+        "also_possible": [],
+    }

@@ -1,0 +1,300 @@
+"""Runs S windows at once on one working model: what World.simulate is made of.
+
+Effects change copies of the model, or the control signal before the run, so that
+a whole window is one call of mujoco.batch.Batch; only forces that depend on the
+state and effects under a condition are worked out step by step.
+"""
+
+import os
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+from diagnosis.simulation.editable_model import BALL, FREE, Working
+from diagnosis.simulation.readout import locate, read
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+RUN_UP = (
+    0.4,
+    0.1,
+)  # seconds before a window to find hidden coordinates from, and between returns to the record
+SHOTS = 5  # corrections of a start that delayed sensors show late
+
+
+class Engine:
+    """Simulator for settings with the same structure, a frozenset of the candidates that need parts of their own."""
+
+    def __init__(self, spec, nominal, structure):
+        self.working, self.nominal = Working(spec, nominal, structure), nominal
+        self.model, self.q, self.v = self.working.model, self.working.q, self.working.v
+        self.rest = np.empty(mujoco.mj_stateSize(self.model, STATE))
+        mujoco.mj_getState(self.model, self.working.data, self.rest, STATE)
+        self.batch = None
+
+    def run(self, cases, start_qpos, start_qvel, windows, rows, step, count, sensors):
+        """World.simulate for n simulations that share structure, time step and way of stepping.
+
+        Returns qpos (n, rows, nq), qvel (n, rows, nv) and, if `sensors`, sensordata (n, rows, nsensordata).
+        """
+        measures, sensor_measures = self._measures(cases)
+        (offset, ratio, delay), recordings = measures, [w.recording for w in windows]
+        # a window begins as long before its first row as its latest sensor is late, but not before the recording
+        early = np.maximum(
+            delay.max(axis=1, initial=0.0), sensors * sensor_measures[2].max(axis=1, initial=0.0)
+        )
+        early = np.minimum(
+            early, [w.recording.time[w.first] - w.recording.time[0] for w in windows]
+        )
+        begin = np.array([w.recording.time[w.first] for w in windows]) - early
+        q, v = self._true(start_qpos, start_qvel, measures)
+        qpos, qvel = (
+            np.tile(self.model.qpos0, (len(cases), 1)),
+            np.zeros((len(cases), self.model.nv)),
+        )
+        if self.model.nq > self.nominal.nq:
+            qpos, qvel = self._run_up(cases, windows, begin, measures, step)
+        qpos[:, self.q], qvel[:, self.v] = q, v
+        if early.any():
+            lead = int(np.ceil(early.max() / step)) + 1
+            for _ in range(SHOTS):
+                trial = self._trajectory(cases, recordings, begin, qpos, qvel, step, lead)
+                shown = read(
+                    self.nominal,
+                    trial[0][..., self.q],
+                    trial[1][..., self.v],
+                    early[:, None],
+                    step,
+                    delay,
+                )
+                qpos[:, self.q] += q - shown[0][:, 0]
+                qvel[:, self.v] += v - shown[1][:, 0]
+            count += lead
+
+        q, v, data = self._trajectory(cases, recordings, begin, qpos, qvel, step, count, sensors)
+        time = np.full((len(cases), rows), np.nan)
+        for s, w in enumerate(windows):
+            time[s, : w.last - w.first + 1] = w.recording.time[w.first : w.last + 1] - begin[s]
+        qpos, qvel = read(self.nominal, q[..., self.q], v[..., self.v], time, step, delay)
+        simple_q, simple_v = simple(self.nominal)
+        qpos[..., simple_q] = qpos[..., simple_q] * ratio[:, None] + offset[:, None]
+        qvel[..., simple_v] *= ratio[:, None]
+        qpos[:, 0], qvel[:, 0] = start_qpos, start_qvel
+        if not sensors:
+            return qpos, qvel
+        offset, ratio, delay = sensor_measures
+        s, k, f = locate(np.maximum(time[..., None] - delay[:, None], 0.0) / step, count + 1)
+        column = np.arange(delay.shape[1])
+        values = (1 - f) * data[s, k, column] + f * data[s, np.minimum(k + 1, count), column]
+        return (
+            qpos,
+            qvel,
+            np.where(np.isnan(time)[..., None], np.nan, values * ratio[:, None] + offset[:, None]),
+        )
+
+    def _true(self, qpos, qvel, measures):
+        """Positions and velocities behind what sensors show, but for their delays."""
+        (simple_q, simple_v), (offset, ratio, _) = simple(self.nominal), measures
+        qpos, qvel = qpos.copy(), qvel.copy()
+        qpos[:, simple_q], qvel[:, simple_v] = (
+            (qpos[:, simple_q] - offset) / ratio,
+            qvel[:, simple_v] / ratio,
+        )
+        return qpos, qvel
+
+    def _run_up(self, cases, windows, begin, measures, step):
+        """States (n, ·) of the working model at `begin`, for what the recording does not show of them.
+
+        From RUN_UP seconds before, always again from what was recorded, with the hidden
+        coordinates running on; at rest in the middle where nothing was recorded.
+        """
+        n = len(cases)
+        qpos, qvel = np.tile(self.model.qpos0, (n, 1)), np.zeros((n, self.model.nv))
+        recordings = [w.recording for w in windows]
+        marks = [begin - back for back in np.arange(RUN_UP[0], 0.0, -RUN_UP[1])] + [begin]
+        marks = [np.maximum(t, [r.time[0] for r in recordings]) for t in marks]
+        for now, then in zip(marks[:-1], marks[1:]):
+            recorded = [recorded_state(self.nominal, r, t) for r, t in zip(recordings, now)]
+            q, v = self._true(*map(np.array, zip(*recorded)), measures)
+            known = np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1)
+            qpos[np.ix_(known, self.q)], qvel[np.ix_(known, self.v)] = q[known], v[known]
+            steps = np.rint((then - now) / step).astype(int)
+            if steps.any():
+                trajectory = self._trajectory(cases, recordings, now, qpos, qvel, step, steps.max())
+                for state, run in zip((qpos, qvel), trajectory):
+                    run = run[np.arange(n), steps]
+                    state[:] = np.where(np.isfinite(run).all(axis=1, keepdims=True), run, state)
+        return qpos, qvel
+
+    def _trajectory(self, cases, recordings, begin, qpos, qvel, step, count, sensors=False):
+        """Every step from states qpos (n, nq), qvel (n, nv) of the working model at times `begin` (n,).
+
+        Returns q (n, 1 + count, nq), v (n, 1 + count, nv), sensordata (n, 1 + count, ·) or None; NaN after
+        the first state of a simulation that failed.
+        """
+        n, memo, drive = len(cases), {}, self.working.drive
+        on = [drive(c.on, r, t, step, count, memo) for c, r, t in zip(cases, recordings, begin)]
+        off = [
+            drive(c.off, r, t, step, count, memo) if c.when else d
+            for c, r, t, d in zip(cases, recordings, begin, on)
+        ]
+        if self.batch is None or self.batch.nsim < n:
+            self.batch = Batch(self.model, 1 << (n - 1).bit_length(), threads())
+        batch = self.batch
+        batch.warning[:] = 0
+        batch.state[:n] = self.rest
+        batch.bind("qpos")[:n], batch.bind("qvel")[:n] = qpos, qvel
+        if self.model.na:
+            batch.bind("act")[:n] = [
+                self.working.activation(r, t) for r, t in zip(recordings, begin)
+            ]
+        # sensordata belongs to the state before a step, so sensors need one step more
+        record = ("qpos", "qvel", "sensordata") if sensors else ("qpos", "qvel")
+        out = {
+            f: np.full((n, count + sensors, getattr(self.working.data, f).size), np.nan)
+            for f in record
+        }
+        if cases[0].stepwise:
+            failed = self._step(batch, cases, recordings, on, off, begin, step, out)
+        else:
+            failed = self._rollout(batch, on, out)
+        failed |= batch.warning[:n, :, 1].any(axis=1)
+        failed |= np.array([a.model is None or b.model is None for a, b in zip(on, off)])
+        q = np.concatenate([qpos[:, None], out["qpos"][:, :count]], axis=1)
+        v = np.concatenate([qvel[:, None], out["qvel"][:, :count]], axis=1)
+        q[failed, 1:] = v[failed, 1:] = np.nan
+        if sensors:
+            out["sensordata"][failed] = np.nan
+        return q, v, out.get("sensordata")
+
+    def _rollout(self, batch, drives, out):
+        """Run all steps in one call; fill out, return which simulations failed (n,)."""
+        n, failed = len(drives), np.zeros(len(drives), bool)
+        batch.set_models([d.model or self.model for d in drives] + [self.model] * (batch.nsim - n))
+        batch.bind("qfrc_applied")[:n] = [d.qfrc for d in drives]
+        batch.bind("xfrc_applied")[:n] = [d.xfrc for d in drives]
+        ctrl, count = np.array([d.ctrl for d in drives]), out["qpos"].shape[1]
+        ctrl = np.pad(ctrl, ((0, 0), (0, count - ctrl.shape[1]), (0, 0)), mode="edge")
+        try:
+            batch.rollout(
+                count,
+                ctrl if self.nominal.nu else None,
+                record=tuple(out),
+                ids=np.arange(n),
+                out=out,
+            )
+        except SimulationError as error:
+            failed[error.ids] = True
+        return failed
+
+    def _step(self, batch, cases, recordings, on, off, begin, step, out):
+        """As _rollout, with forces that depend on the state and conditions looked at before each step."""
+        n, failed = len(cases), np.zeros(len(cases), bool)
+        ids, spare = np.arange(n), [self.model] * (batch.nsim - n)
+        live = {
+            f: batch.bind(f) for f in {"qpos", "qvel", "ctrl", "qfrc_applied", "xfrc_applied", *out}
+        }
+        ctrl, qfrc, xfrc = (
+            [np.array([getattr(d, f) for d in drives]) for drives in (on, off)]
+            for f in ("ctrl", "qfrc", "xfrc")
+        )
+        forces = [self._forces(drives) for drives in (on, off)]
+        always, never = (-np.inf, np.inf), (np.inf, np.inf)
+        low, high = np.array(
+            [
+                always if not c.when else c.when["time"] if c.when["recording"] == r.name else never
+                for c, r in zip(cases, recordings)
+            ]
+        ).T
+        active = None
+        for k in range(out["qpos"].shape[1]):
+            time = begin + k * step
+            now = (low <= time) & (time < high)
+            if active is None or (now != active).any():
+                active = now
+                batch.set_models(
+                    [(a if yes else b).model or self.model for a, b, yes in zip(on, off, active)]
+                    + spare
+                )
+            j, yes = min(k, ctrl[0].shape[1] - 1), active[:, None]
+            live["ctrl"][:n] = np.where(yes, ctrl[0][:, j], ctrl[1][:, j])
+            push = np.where(yes, *qfrc)
+            for functions, chosen in zip(forces, (active, ~active)):
+                for members, function in functions:
+                    added = function(
+                        live["qpos"][members],
+                        live["qvel"][members],
+                        live["ctrl"][members],
+                        time[members],
+                    )
+                    push[members] += np.where(chosen[members, None], added, 0.0)
+            live["qfrc_applied"][:n] = push
+            live["xfrc_applied"][:n] = np.where(yes[..., None], *xfrc)
+            try:
+                batch.step(ids)
+            except SimulationError as error:
+                failed[error.ids] = True
+            for f in out:
+                out[f][:, k] = live[f][:n]
+        return failed
+
+    def _forces(self, drives):
+        """[(members, function)] of the state-dependent forces of simulations."""
+        groups = {}
+        for s, drive in enumerate(drives):
+            for candidate, values in drive.items:
+                if candidate.effect.overrides("force") and drive.model is not None:
+                    groups.setdefault(candidate, []).append((s, values))
+        forces = []
+        for candidate, members in groups.items():
+            ids, values = map(np.array, zip(*members))
+            i = candidate.effect.id(self.model, candidate.place.name)
+            function = candidate.effect.force([drives[s].model for s in ids], i, values)
+            if function is not None:
+                forces.append((ids, function))
+        return forces
+
+    def _measures(self, cases):
+        """(offset, ratio, delay) (3, n, ·) of the hinges and slides, and of sensordata."""
+        m = self.nominal
+        simple_q, _ = simple(m)
+        measures = [np.zeros((3, len(cases), width)) for width in (len(simple_q), m.nsensordata)]
+        for measure in measures:
+            measure[1] = 1.0
+        for s, case in enumerate(cases):
+            for candidate, values in case.on:
+                if candidate.effect.overrides("measure"):
+                    offset, ratio, delay = candidate.effect.measure(values)
+                    if candidate.place.kind == "sensor":
+                        i = m.sensor(candidate.place.name).id
+                        part = measures[1][
+                            :, s, m.sensor_adr[i] : m.sensor_adr[i] + m.sensor_dim[i]
+                        ]
+                    else:
+                        column = list(simple_q).index(m.joint(candidate.place.name).qposadr[0])
+                        part = measures[0][:, s, column]
+                    part[0], part[1], part[2] = part[0] + offset, part[1] * ratio, part[2] + delay
+        return measures
+
+
+def threads():
+    """Threads to run on: OMP_NUM_THREADS, where that is set as for other numerical libraries, else all CPUs (0)."""
+    number = os.environ.get("OMP_NUM_THREADS", "")
+    return int(number) if number.isdigit() else 0
+
+
+def simple(model):
+    """Addresses in qpos and in qvel of the hinges and slides."""
+    joints = ~np.isin(model.jnt_type, (FREE, BALL))
+    return model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+
+
+def recorded_state(model, recording, t):
+    """qpos (nq,) and qvel (nv,) at the row nearest to time t: velocities as measured, else over the rows around it."""
+    row = int(np.argmin(abs(recording.time - t)))
+    a, b, qvel = max(row - 1, 0), min(row + 1, len(recording.time) - 1), np.full(model.nv, np.nan)
+    if b > a:
+        seconds = recording.time[b] - recording.time[a]
+        mujoco.mj_differentiatePos(model, qvel, seconds, recording.qpos[a], recording.qpos[b])
+    measured = recording.qvel[row]
+    return recording.qpos[row], np.where(np.isfinite(measured), measured, qvel)

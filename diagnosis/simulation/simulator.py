@@ -1,0 +1,309 @@
+"""A nominal simulator made ready for every effect of the catalogue, many runs at once.
+
+world = World.load('sim.xml')                       # or World.from_env('Hopper-v5')
+friction = world.candidate('coulomb_friction', 'elbow')
+windows = [Window(recording, 0, 30), Window(recording, 30, 60)]
+qpos, qvel = world.simulate([{}, {friction: (0.1,)}], start_qpos, start_qvel, windows)
+xml, written = world.corrected_xml({friction: (0.1,)})
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from diagnosis.common.mujoco_warnings import quiet
+from diagnosis.effects import EFFECTS, unmodelled
+from diagnosis.effects.base import HINGE, SLIDE, Candidate, Place
+from diagnosis.simulation.batch import Engine
+from diagnosis.simulation.control_signal import SLACK
+
+CHUNK_BYTES = 64e6  # of trajectory in memory at a time
+
+
+class Window(NamedTuple):
+    """Rows first..last, both included, of a Recording (recordings.py)."""
+
+    recording: object
+    first: int
+    last: int
+
+
+class World:
+    """`model` is the nominal MjModel, `candidates` the whole catalogue on it.
+
+    A joint, actuator, body, geom or sensor without a name is named by its index.
+    """
+
+    def __init__(self, spec):
+        self.spec = spec.copy()
+        with quiet():
+            self.spec.compile()
+            s = self.spec
+            for elements in (s.joints, s.actuators, s.bodies[1:], s.geoms, s.sensors):
+                taken = {e.name for e in elements}
+                for element in elements:
+                    if not element.name:
+                        index = str(element.id)
+                        element.name = f"index {index}" if index in taken else index
+            self.model = m = self.spec.compile()
+        for (
+            actuator
+        ) in s.actuators:  # what the compiler works out of the mass, it would again of another one
+            if actuator.biasprm[2] > 0:
+                actuator.biasprm[2] = m.actuator(actuator.name).biasprm[2]
+            if actuator.inheritrange > 0:  # of the joint, whose range may be what is wrong
+                field = (
+                    "actrange"
+                    if actuator.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
+                    else "ctrlrange"
+                )
+                setattr(actuator, field, getattr(m.actuator(actuator.name), field).ravel())
+                actuator.inheritrange = 0
+        for joint in s.joints:
+            if any(joint.springdamper):
+                j = m.joint(joint.name)
+                joint.stiffness, joint.damping, joint.springdamper = (
+                    [j.stiffness[0], 0, 0],
+                    [j.damping[0], 0, 0],
+                    [0, 0],
+                )
+        self.candidates, taken = [], {e.name for e in (*self.spec.actuators, *self.spec.joints)}
+        for effect in EFFECTS:
+            for name in effect.places(self.model):
+                if (
+                    f"{effect.name}:{name}" in taken
+                ):  # this model is a corrected one, which has it already
+                    continue
+                parameters = effect.parameters(self.model, effect.id(self.model, name))
+                self.candidates.append(
+                    Candidate(effect, Place(effect.kind, name), tuple(parameters))
+                )
+        self._engines = {}
+        self.fits = {}  # of start states, that shooting remembers for as long as this world is looked at
+
+    @classmethod
+    def load(cls, path):
+        """The World of an MJCF file. ValueError, of one line, if it does not compile."""
+        try:
+            with quiet():
+                world = cls(mujoco.MjSpec.from_file(str(path)))
+                mujoco.MjSpec.from_string(
+                    world.corrected_xml({})[0]
+                ).compile()  # before the work: can it be written as one file?
+            return world
+        except ValueError as error:
+            raise ValueError(" ".join(str(error).split())) from None
+
+    @classmethod
+    def from_env(cls, env_id):
+        """The World of a gymnasium MuJoCo environment's model file. ValueError if it has none."""
+        import gymnasium  # only here: a user with an MJCF file does not need it
+
+        try:
+            with quiet():  # an old version of an environment is what was asked for
+                env = gymnasium.make(env_id)
+        except gymnasium.error.Error as error:
+            raise ValueError(" ".join(str(error).split())) from None
+        try:
+            path = getattr(env.unwrapped, "fullpath", None)
+        finally:
+            env.close()
+        if path is None:
+            raise ValueError(f"{env_id} is not a MuJoCo environment")
+        return cls.load(path)
+
+    def candidate(self, effect, place):
+        """The Candidate of an effect and a place, by their names; KeyError if it cannot sit there."""
+        for candidate in self.candidates:
+            if (candidate.effect.name, candidate.place.name) == (effect, place):
+                return candidate
+        raise KeyError(f"{effect} cannot sit at {place}")
+
+    def curve(self, joint, variable, knots, factor=None, wave=False):
+        """Candidate `unknown`: a force in a joint as a curve of 'position:<joint>', 'velocity:<joint>',
+        'control:<actuator>' or 'time', linear between knots; its parameters are the forces at the knots. See curves.Unknown."""
+        return unmodelled.curve(self.model, joint, variable, knots, factor, wave)
+
+    def localised(self, candidate, when):
+        """The same candidate acting only under a condition (see Candidate.when)."""
+        return replace(candidate, when=when)
+
+    def probes(self, candidate, recordings):
+        """Values (P, parameters) worth a first try, for effects whose nominal value has no gradient too."""
+        return candidate.effect.probes(
+            self.model, candidate.effect.id(self.model, candidate.place.name), recordings
+        )
+
+    def far(self, candidate, recordings):
+        """Values (P, parameters) to try besides a small step."""
+        return candidate.effect.far(
+            self.model, candidate.effect.id(self.model, candidate.place.name), recordings
+        )
+
+    def suited(self, candidate, recordings):
+        """The candidate with steps and bounds that suit the recorded motion."""
+        i = candidate.effect.id(self.model, candidate.place.name)
+        return replace(
+            candidate,
+            parameters=candidate.effect.suited(candidate.parameters, self.model, i, recordings),
+        )
+
+    def related(self, candidate):
+        """Candidates at the same joints in whose wrong values this one may hide, or theirs in its."""
+        mine, out = self.joints(candidate.place), []
+        for other in self.candidates:
+            theirs = self.joints(other.place)
+            akin = (
+                other.effect.name in candidate.effect.related
+                or candidate.effect.name in other.effect.related
+            )
+            if akin and other.effect.name != candidate.effect.name:
+                if mine is None or theirs is None or mine & theirs:
+                    out.append(other)
+        return out
+
+    def joints(self, place):
+        """Ids of the joints a place belongs to, or None for all."""
+        m = self.model
+        if place.kind == "joint":
+            return {m.joint(place.name).id}
+        if place.kind == "body":
+            return {j for j in range(m.njnt) if m.jnt_bodyid[j] == m.body(place.name).id}
+        if place.kind == "actuator" and m.actuator_trntype[m.actuator(place.name).id] == int(
+            mujoco.mjtTrn.mjTRN_JOINT
+        ):
+            return {m.actuator_trnid[m.actuator(place.name).id, 0]}
+        return None
+
+    def simulate(self, settings, start_qpos, start_qvel, windows, refine=1, sensors=False):
+        """Predict what the sensors show in S windows, each under its own setting.
+
+        settings: S dicts {Candidate: values}, values being the candidate's parameters in
+            order, absolute. An empty dict is the nominal model. Simulations that share
+            one dict object share the work of preparing it.
+        start_qpos (S, nq), start_qvel (S, nv): the state at each window's first row as
+            the joints' sensors show it (under sensor_bias and the like of the setting).
+        windows: S Windows. Each runs on its recording's control, held between rows;
+            delays, lags and filters run on from the control recorded before the window (before
+            the first row: its control, for ever).
+        refine: divide the simulator's time step by this integer.
+        sensors: also predict the model's sensors.
+
+        Returns qpos (S, T, nq), qvel (S, T, nv), and with `sensors` sensordata (S, T,
+        nsensordata), at the rows of each window, T the most rows of any; row 0 of qpos and
+        qvel is the start. NaN where a window has fewer rows, and in all later rows of a
+        simulation that became unstable or whose setting MuJoCo refuses. Rows that fall
+        between time steps are interpolated. The same input gives the same output.
+        """
+        rows = max(w.last - w.first + 1 for w in windows)
+        out = [
+            np.full((len(windows), rows, n), np.nan)
+            for n in (self.model.nq, self.model.nv, self.model.nsensordata)
+        ]
+        cases, groups = {}, {}
+        for s, setting in enumerate(settings):
+            if id(setting) not in cases:
+                cases[id(setting)] = Case(self.model, setting, refine)
+            case = cases[id(setting)]
+            groups.setdefault((case.structure, case.step, case.stepwise, case.late), []).append(
+                (s, case)
+            )
+        start_qpos, start_qvel = np.asarray(start_qpos, float), np.asarray(start_qvel, float)
+        with quiet():
+            for (structure, step, *_), members in groups.items():
+                if structure not in self._engines:
+                    self._engines[structure] = Engine(self.spec, self.model, structure)
+                engine = self._engines[structure]
+                duration = max(
+                    r.time[last] - r.time[first]
+                    for r, first, last in (windows[s] for s, _ in members)
+                )
+                count = max(1, int(np.ceil(duration / step - SLACK)))
+                width = (
+                    self.model.nu
+                    + engine.model.nq
+                    + engine.model.nv
+                    + sensors * self.model.nsensordata
+                )
+                chunk = int(np.clip(CHUNK_BYTES / (8 * count * width), 1, 1024))
+                for k in range(0, len(members), chunk):
+                    ids, chosen = zip(*members[k : k + chunk])
+                    ids = list(ids)
+                    some = [windows[s] for s in ids]
+                    run = engine.run(
+                        chosen, start_qpos[ids], start_qvel[ids], some, rows, step, count, sensors
+                    )
+                    for whole, part in zip(out, run):
+                        whole[ids] = part
+        return tuple(out) if sensors else tuple(out[:2])
+
+    def corrected_xml(self, setting):
+        """The model with the effects of a setting, as MJCF for stock MuJoCo.
+
+        Returns (xml, {Candidate: 'mjcf' | 'measurement' | 'none'}): where each effect is
+        held. Values keep all their digits; paths of meshes and other files become absolute.
+        """
+        spec, written = self.spec.copy(), {candidate: "mjcf" for candidate in setting}
+        time_step_first = lambda item: (
+            item[0].effect.name != "time_step"
+        )  # delays, lags and friction are written by it
+        for candidate, values in sorted(Case(self.model, setting, 1).on, key=time_step_first):
+            i = candidate.effect.id(self.model, candidate.place.name)
+            written[candidate] = (
+                "none" if candidate.when else candidate.effect.write(spec, self.model, i, values)
+            )
+        for actuator in (
+            spec.actuators
+        ):  # the history must reach back far enough, whatever the time step became
+            if actuator.delay > 0:
+                actuator.nsample = max(
+                    actuator.nsample, int(np.ceil(actuator.delay / spec.option.timestep - 1e-9)) + 1
+                )
+        folder = Path(self.spec.modelfiledir).absolute()
+        spec.meshdir, spec.texturedir = (
+            str(folder / self.spec.meshdir),
+            str(folder / self.spec.texturedir),
+        )
+        spec.compiler.savecompiled = spec.compiler.savecanonical = False
+        with quiet():
+            model = spec.compile()
+            for key, old in zip(
+                spec.keys, self.model.key_qpos
+            ):  # joints may have been added between the others, and zeros moved
+                place = model.qpos0.copy()
+                for mine in map(self.model.joint, range(self.model.njnt)):
+                    its, width = model.joint(mine.name), len(mine.qpos0)
+                    moved = its.qpos0 - mine.qpos0 if mine.type[0] in (HINGE, SLIDE) else 0.0
+                    place[its.qposadr[0] : its.qposadr[0] + width] = (
+                        old[mine.qposadr[0] : mine.qposadr[0] + width] + moved
+                    )
+                key.qpos = place
+            if spec.keys:
+                spec.compile()
+            return spec.to_xml(), written
+
+
+class Case:
+    """One setting, resolved: `on` [(candidate, values)] in the order of the catalogue, without those at their
+    nominal values; `off` those that act without a condition; `when` the condition of the others, if any."""
+
+    def __init__(self, model, setting, refine):
+        order = {effect: k for k, effect in enumerate(EFFECTS)}
+        items = [(c, tuple(float(v) for v in values)) for c, values in setting.items()]
+        items = [(c, v) for c, v in items if v != c.nominal]
+        self.on = sorted(items, key=lambda item: order.get(item[0].effect, len(order)))
+        self.off = [(c, v) for c, v in self.on if not c.when]
+        conditions = [c.when for c, _ in self.on if c.when]
+        if any(when != conditions[0] for when in conditions):
+            raise ValueError("effects under different conditions cannot be simulated together")
+        self.when = conditions[0] if conditions else None
+        steps = [v[0] for c, v in self.on if c.effect.name == "time_step"]
+        self.step = (steps[0] if steps else model.opt.timestep) / refine
+        self.structure = frozenset(c for c, _ in self.on if c.effect.overrides("build"))
+        self.stepwise = bool(self.when) or any(c.effect.overrides("force") for c, _ in self.on)
+        self.late = any(
+            c.effect.measure(v)[2] for c, v in self.on
+        )  # which takes a start of its own

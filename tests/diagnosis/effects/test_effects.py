@@ -1,0 +1,400 @@
+"""Effects: what a batch simulates is what stock MuJoCo makes of corrected.xml, and nothing at zero size."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from plants import MODELS, SIZES, START, T, arm, commanded, pendulum, record, simulate, stock
+
+from diagnosis.effects import EFFECTS
+from diagnosis.effects.unmodelled import asked
+from diagnosis.simulation.simulator import Window, World
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def case(request):
+    world, xml = arm(request.param)
+    return world, xml, record(world)
+
+
+def test_the_contracts_effects_are_all_there():
+    assert {effect.name for effect in EFFECTS} == set(SIZES)
+
+
+def test_nothing_is_exactly_nominal(case):
+    world, xml, recording = case
+    expected = stock(xml, world, recording, *START)
+    assert np.ptp(expected, axis=0).min() > 0.02
+    for qpos in simulate(world, [{}] + [{c: c.nominal} for c in world.candidates], recording):
+        np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-12)
+
+
+def test_zero_size_is_the_limit_of_small_sizes(case):
+    """What is left out at its nominal value is also what a vanishing effect tends to: no jump there."""
+    world, xml, recording = case
+    expected = stock(xml, world, recording, *START)[:20]
+    for candidate in world.candidates:
+        if (
+            candidate.effect.name in ("backlash", "time_step")
+            or not np.isfinite(candidate.nominal).all()
+        ):
+            continue  # the motor's inertia, the number of steps, limits that begin at infinity
+        values = tuple(p.nominal + 1e-6 * p.step for p in candidate.parameters)
+        (qpos,) = simulate(world, [{candidate: values}], recording, 20)
+        assert abs(qpos - expected).max() < 2e-6, candidate
+
+
+def test_every_effect_is_the_same_in_mjcf(case):
+    world, xml, recording = case
+    predicted = simulate(
+        world, [{}] + [{c: SIZES[c.effect.name]} for c in world.candidates], recording
+    )
+    felt = set()
+    for candidate, qpos in zip(world.candidates, predicted[1:]):
+        corrected, written = world.corrected_xml({candidate: SIZES[candidate.effect.name]})
+        assert np.isfinite(qpos).all(), candidate
+        if candidate.place.kind != "sensor" and abs(qpos - predicted[0]).max() > 1e-3:
+            felt.add(candidate.effect.name)
+        if candidate.effect.name == "dead_zone" and written[candidate] == "mjcf":  # a little late
+            late, size = (
+                abs(stock(corrected, world, recording, *START) - qpos)[:20],
+                abs(predicted[0] - qpos)[:20],
+            )
+            assert late.max() < 0.5 * size.max() and late.mean() < 0.5 * size.mean()
+        elif written[candidate] == "mjcf" and candidate.effect.name != "stribeck_friction":
+            # Runge-Kutta reads delays and lags at its stages, here they are averaged over the step
+            close = 3e-4 if candidate.effect.name in ("delay", "lag") else 1e-9
+            np.testing.assert_allclose(
+                stock(corrected, world, recording, *START),
+                qpos,
+                rtol=0,
+                atol=close,
+                err_msg=repr(candidate),
+            )
+    contact = {
+        "contact_friction",
+        "contact_stiffness",
+        "contact_damping",
+        "ground_height",
+    }  # the servos hold the arm off the floor
+    assert felt | contact == set(SIZES)
+
+
+def test_all_effects_together_are_the_same_in_mjcf(case):
+    """One setting of many effects: each is written beside the others."""
+    world, xml, recording = case
+    places = {"elbow", "bend", "fore", "world", "tip"}
+    leave = {
+        "stribeck_friction",
+        "dead_zone",
+        "sensor_scale",
+        "sensor_delay",
+        "payload_change",
+        "time_step",
+        "backlash",
+        "delay",
+        "lag",
+        "joint_stop",
+    }
+    setting = {
+        c: SIZES[c.effect.name]
+        for c in world.candidates
+        if c.place.name in places and c.effect.name not in leave
+    }
+    assert len(setting) > 20
+    corrected, written = world.corrected_xml(setting)
+    assert set(written.values()) == {"mjcf"}
+    (qpos,) = simulate(world, [setting], recording, 20)
+    np.testing.assert_allclose(
+        stock(corrected, world, recording, *START, 20), qpos, rtol=0, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "kind, effect, place, values",
+    [
+        ("euler", "delay", "bend", (0.0015,)),
+        ("rk4", "delay", "bend", (0.0015,)),
+        ("rk4", "lag", "bend", (0.0008,)),
+        ("motors", "stribeck_friction", "elbow", (0.1, 0.2, 0.3)),
+    ],
+)
+def test_what_is_written_by_the_time_step_is_by_the_corrected_one(kind, effect, place, values):
+    """Beside a finer time step an effect is written as into a model that had it from the beginning."""
+    world, xml = arm(kind)
+    fine = World(mujoco.MjSpec.from_string(xml.replace('timestep="0.002"', 'timestep="0.001"')))
+    together = {
+        world.candidate(effect, place): values,
+        world.candidate("time_step", "world"): (0.001,),
+    }
+    alone = {fine.candidate(effect, place): values}
+    assert (
+        world.corrected_xml(together)[0]
+        == fine.corrected_xml(alone)[0]
+        != world.corrected_xml({})[0]
+    )
+
+
+def test_stribeck_friction_in_mjcf_and_by_hand():
+    """Bristles, frictionloss with a force, and the law itself at a fine step agree through reversals and sticking."""
+    world, (coulomb, static, velocity) = pendulum(), (0.1, 0.2, 0.3)
+    time = np.arange(100) * 0.01
+    recording = commanded(time, (0.5 * np.sin(6 * time) + 0.3 * np.sin(14 * time + 1))[:, None])
+    setting = {world.candidate("stribeck_friction", "j"): (coulomb, static, velocity)}
+    qpos, _ = world.simulate(
+        [setting, {}], [[0.0]] * 2, [[1.0]] * 2, [Window(recording, 0, 99)] * 2
+    )
+    corrected, _ = world.corrected_xml(setting)
+    by_hand, q, v, h = [0.0], 0.0, 1.0, 1e-5
+    for t in range(99):
+        for _ in range(1000):
+            free = v + h / 0.025 * (recording.ctrl[t, 0] - 0.5 * 9.81 * 0.1 * np.sin(q))
+            stop = h / 0.025 * (coulomb + (static - coulomb) * np.exp(-((v / velocity) ** 2)))
+            v = np.sign(free) * max(abs(free) - stop, 0.0)
+            q += h * v
+        by_hand.append(q)
+    assert abs(qpos[1, :, 0] - by_hand).max() > 0.2
+    assert abs(qpos[0, :, 0] - by_hand).max() < 3e-3
+    assert abs(stock(corrected, world, recording, [0.0], [1.0], 100)[:, 0] - by_hand).max() < 0.02
+
+
+def test_stribeck_friction_that_does_not_fall_is_coulomb_friction():
+    world = pendulum()
+    stribeck, friction = (
+        world.candidate("stribeck_friction", "j"),
+        world.candidate("coulomb_friction", "j"),
+    )
+    for static in (0.1, 0.08):  # below coulomb, as a fit may have it: still a model that runs
+        xml, written = world.corrected_xml({stribeck: (0.1, static, 0.3)})
+        model = mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(model)
+        data.qvel[0] = 1.0
+        mujoco.mj_step(model, data, 300)
+        assert (
+            written == {stribeck: "mjcf"}
+            and np.isfinite(data.qpos).all()
+            and abs(data.qvel[0]) < 1.0
+        )
+    xml = [
+        world.corrected_xml({c: v})[0] for c, v in ((stribeck, (0.1, 0.1, 0.3)), (friction, (0.1,)))
+    ]
+    assert xml[0] == xml[1]
+
+
+def test_coulomb_friction_holds():
+    """Below its limit the joint stands still: no creep, unlike MuJoCo's default friction."""
+    world = pendulum()
+    recording = commanded(np.array([0.0, 1.0]), np.full((2, 1), 0.09))
+    setting = {world.candidate("coulomb_friction", "j"): (0.12,)}
+    qpos, _ = world.simulate([setting], [[0.0]], [[0.0]], [Window(recording, 0, 1)])
+    assert abs(qpos[0, 1, 0]) < 2e-4
+
+
+def test_unknown_curves():
+    """A curve through damping's values is damping, in simulation and in MJCF; a wiggle has no MJCF form."""
+    world = pendulum()
+    time = np.arange(60) * 0.01
+    recording = commanded(time, 0.5 * np.sin(9 * time)[:, None])
+    knots = np.linspace(-6, 6, 25)
+    curve, damping = world.curve("j", "velocity:j", knots), world.candidate("viscous_damping", "j")
+    spring = world.curve("j", "position:j", np.linspace(-1, 2, 61))
+    follow = world.curve("j", "control:m", (-1.0, 1.0))
+    drift = world.curve("j", "time", (0.0, 1.0))
+    bent = tuple(0.3 - 0.5 * (x - 0.1 * x**2 + 0.2 * x**3) for x in np.linspace(-1, 2, 61))
+    settings_ = [
+        {curve: tuple(-0.1 * knots)},
+        {damping: (0.1,)},
+        {follow: (-0.3, 0.3)},
+        {world.candidate("gain", "m"): (1.3,)},
+        {drift: (0.2, 0.2)},
+        {world.candidate("spring_offset", "j"): (0.2,)},
+        {spring: bent},
+    ]
+    qpos, _ = world.simulate(settings_, [[0.3]] * 7, [[0.5]] * 7, [Window(recording, 0, 59)] * 7)
+    np.testing.assert_allclose(
+        qpos[0], qpos[1], atol=2e-3
+    )  # the curve is explicit, damping implicit
+    np.testing.assert_allclose(qpos[2], qpos[3], atol=1e-12)
+    np.testing.assert_allclose(qpos[4], qpos[5], atol=1e-12)
+    for k, candidate in ((0, curve), (6, spring)):
+        xml, written = world.corrected_xml(settings_[k])
+        assert written == {candidate: "mjcf"}
+        np.testing.assert_allclose(
+            stock(xml, world, recording, [0.3], [0.5], 60), qpos[k], atol=2e-3
+        )
+    assert world.corrected_xml({curve: tuple(np.sin(3 * knots))})[1] == {curve: "none"}
+    assert (
+        curve
+        == world.curve("j", "velocity:j", list(knots))
+        != world.curve("j", "velocity:j", knots + 1)
+    )
+
+
+def test_what_actuators_are_asked_is_their_force_over_their_gain():
+    for kind in ("motors", "servos"):
+        model = arm(kind)[0].model
+        data, rng = mujoco.MjData(model), np.random.default_rng(0)
+        for _ in range(5):
+            data.qpos, data.qvel, data.ctrl = (
+                rng.normal(size=model.nq),
+                rng.normal(size=model.nv),
+                rng.uniform(-0.1, 0.1, model.nu),
+            )
+            model.actuator_forcelimited[:] = 0
+            mujoco.mj_forward(model, data)
+            for a in range(model.nu):
+                assert asked(model, a, data.qpos, data.qvel, data.ctrl) * model.actuator_gainprm[
+                    a, 0
+                ] == pytest.approx(data.actuator_force[a])
+
+
+def test_probes_show_something(case):
+    """Values to try first lie within the bounds and change the motion."""
+    world, _, recording = case
+    recording = replace(recording, qpos=simulate(world, [{}], recording)[0])
+    for candidate in world.candidates:
+        rows = np.array([*world.probes(candidate, [recording]), *world.far(candidate, [recording])])
+        suited = world.suited(candidate, [recording]).parameters
+        low, high = (np.array([getattr(p, bound) for p in suited]) for bound in ("low", "high"))
+        assert rows.ndim == 2 and rows.shape[1] == len(low) and len(rows), candidate
+        assert (((rows >= low) & (rows <= high)) | np.isinf(rows)).all(), candidate
+        assert not (rows == candidate.nominal).all(axis=1).any()
+
+
+def test_stribeck_friction_has_fallen_at_the_speeds_that_are_reached():
+    world, _ = arm("motors")
+    run = replace(
+        record(world),
+        qpos=np.cumsum(np.random.default_rng(0).uniform(0, 0.02, (T, world.model.nq)), 0),
+    )  # at up to 2 rad/s
+    candidate = world.candidate("stribeck_friction", "elbow")
+    velocity = world.suited(candidate, [run]).parameters[2]
+    assert 0.5 < velocity.high < 1.5 and velocity.low < velocity.nominal <= velocity.high
+    assert all(row[2] <= velocity.high for row in world.probes(candidate, [run]))
+
+
+@given(st.floats(0.01, 30), st.floats(0.01, 30))
+def test_small_steps_are_forces_of_one_size_whatever_the_motion(reach, speed):
+    """k·x³ and d·v² at the farthest and fastest row, against the steps of a motion of size one."""
+    world = World(
+        mujoco.MjSpec.from_string("""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body>
+                                            </worldbody></mujoco>""")
+    )
+    there_and_back = reach * np.array([0.0, 1.0, 0.0, -1.0] * 50)
+    time = reach / speed * np.arange(len(there_and_back))
+    recording = SimpleNamespace(qpos=there_and_back[:, None], time=time)
+    for effect, size in (("nonlinear_stiffness", reach**2), ("quadratic_damping", speed)):
+        candidate = world.candidate(effect, "x")
+        [usual], [suited] = candidate.parameters, world.suited(candidate, [recording]).parameters
+        assert suited.step * size == pytest.approx(usual.step, rel=1e-6)
+        assert (
+            suited.low <= usual.low <= suited.nominal == usual.nominal < usual.high <= suited.high
+        )
+
+
+ROD = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="x" axis="0 1 0" range="-1.2 1.5"/><geom size=".1" pos="0 0 .3"/></body>
+  </worldbody><actuator><motor name="m" joint="x"/></actuator></mujoco>"""
+
+
+@given(*[st.floats(-5, 5)] * 2, st.floats(1, 20))
+def test_two_phases_of_a_ripple_make_one(sine, cosine, poles):
+    q, rows = np.linspace(-2, 2, 101), [np.array([0.3, poles, phase]) for phase in (0.0, np.pi / 2)]
+    effect = next(e for e in EFFECTS if e.name == "cogging")
+    (amplitude, same, phase), amount = effect.merged(rows, (sine, cosine))
+    both = 0.3 * (sine * np.sin(poles * q) + cosine * np.cos(poles * q))
+    np.testing.assert_allclose(amount * amplitude * np.sin(same * q + phase), both, atol=1e-12)
+
+
+def test_a_joint_at_its_stop_shows_its_sensors_fault():
+    world = World(mujoco.MjSpec.from_string(ROD))
+    fall = np.r_[np.linspace(0, 1.3, 60), 1.35, 1.3, np.full(40, 1.3)]
+    recording = SimpleNamespace(qpos=fall[:, None], time=0.01 * np.arange(len(fall)))
+    values = {
+        name: world.far(world.candidate(name, "x"), [recording])
+        for name in ("sensor_scale", "sensor_bias")
+    }
+    np.testing.assert_allclose(values["sensor_scale"], [(1.3 / 1.5,)], rtol=1e-3)
+    np.testing.assert_allclose(values["sensor_bias"], [(1.3 - 1.5,)], rtol=1e-2)
+    moving = SimpleNamespace(
+        qpos=np.sin(np.arange(100) / 5)[:, None] * np.linspace(1.3, 0.2, 100)[:, None],
+        time=recording.time[:100],
+    )
+    assert not world.far(world.candidate("sensor_bias", "x"), [moving])
+
+
+def test_related_sit_at_the_same_joint(case):
+    world, _, _ = case
+    related = world.related(world.candidate("coulomb_friction", "elbow"))
+    assert {("viscous_damping", "elbow"), ("back_emf", "bend")} <= {
+        (c.effect.name, c.place.name) for c in related
+    }
+    assert not [c for c in related if c.place.name in ("lift", "swing", "push")]
+
+
+def gym_model(name):
+    return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / f"{name}.xml"
+
+
+@pytest.mark.parametrize(
+    "name, body",
+    [
+        ("hopper", "torso"),
+        ("half_cheetah", "torso"),
+        ("inverted_pendulum", "pole"),
+        ("walker2d", "foot"),
+        ("ant", "torso"),
+        ("humanoid", "pelvis"),
+        ("swimmer", "mid"),
+        ("reacher", "body1"),
+    ],
+)
+def test_gymnasium_models_with_another_mass(tmp_path, name, body):
+    """The traps of these files: inertiafromgeom, settotalmass, angles in degrees, six digits."""
+    world = World.load(gym_model(name))
+    nominal = mujoco.MjModel.from_xml_path(str(gym_model(name)))
+    b, mass = nominal.body(body).id, nominal.body(body).mass[0] * 1.2345678901234
+    (tmp_path / "corrected.xml").write_text(
+        world.corrected_xml({world.candidate("mass", body): (mass,)})[0]
+    )
+    corrected = mujoco.MjModel.from_xml_path(str(tmp_path / "corrected.xml"))
+    assert corrected.body(body).mass[0] == mass
+    nominal.body_inertia[b] *= mass / nominal.body_mass[b]
+    nominal.body_mass[b] = mass
+    mujoco.mj_setConst(nominal, mujoco.MjData(nominal))
+    data = [mujoco.MjData(m) for m in (nominal, corrected)]
+    for model, d in zip((nominal, corrected), data):
+        d.ctrl[:] = 0.3
+        mujoco.mj_step(model, d, 40)
+    np.testing.assert_allclose(data[0].qpos, data[1].qpos, rtol=0, atol=1e-9)
+    for kind, count in (("joint", nominal.njnt), ("actuator", nominal.nu)):
+        for i in range(count):
+            before = getattr(nominal, kind)(i).name
+            assert getattr(corrected, kind)(i).name == before or not before
+
+
+def test_meshes_are_found_from_the_report(tmp_path):
+    (tmp_path / "model" / "parts").mkdir(parents=True)
+    (tmp_path / "report").mkdir()
+    (tmp_path / "model" / "parts" / "tetra.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    (tmp_path / "model" / "rest.xml").write_text(
+        '<mujoco><worldbody><body name="b"><joint/><geom type="mesh" mesh="tetra"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "model" / "sim.xml").write_text(
+        '<mujoco><compiler meshdir="parts"/><asset><mesh file="tetra.obj"/></asset><include file="rest.xml"/></mujoco>'
+    )
+    world = World.load(tmp_path / "model" / "sim.xml")
+    (tmp_path / "report" / "corrected.xml").write_text(
+        world.corrected_xml({world.candidate("coulomb_friction", "0"): (0.5,)})[0]
+    )
+    assert (
+        mujoco.MjModel.from_xml_path(str(tmp_path / "report" / "corrected.xml")).dof_frictionloss[0]
+        == 0.5
+    )

@@ -1,0 +1,89 @@
+"""Grounding by diagnosis: instead of transforming actions, put the physics that was left out into the simulator.
+
+The real trajectories become recordings, diagnose() finds what they show to be missing, and its corrected model
+becomes the world in which the policy improves. It sees what the other methods see: observations and actions.
+"""
+
+import mujoco
+import numpy as np
+
+from diagnosis.command import ModelError, diagnose
+from diagnosis.recordings.recording import Recording, RecordingError
+from envs import BatchEnv, EnvError, model_path
+from rgat import Grounding, GroundingSettings, identity, one_step_error
+
+
+class Physics(Grounding):
+    """Lines 3 and 4 of Algorithm 1 by diagnosis; no action transformer is left to learn."""
+
+    learns_from_real = True
+    least_transitions = 200
+
+    def __init__(self, sim, settings=GroundingSettings()):
+        super().__init__(sim, settings)
+        self.nominal, self.xml = sim, ""
+
+    def fit(self, tau_real, seed):
+        """Line 3: from the raw simulator and all that was recorded so far, the simulator with the missing physics.
+
+        The last one stays where it predicts the recorded transitions better than the new one, or where that has
+        joints that the task does not know, as backlash and dead zones are written.
+        """
+        path = model_path(self.nominal.env_id)
+        try:
+            diagnosis = diagnose(path, recordings_of(self.nominal, tau_real))
+        except (RecordingError, ModelError) as error:
+            raise EnvError(f"no diagnosis from {len(tau_real)} real transitions: {error}") from None
+
+        def error(xml):
+            try:
+                return one_step_error(self._simulator(xml), identity, tau_real)[0]
+            except EnvError:
+                return np.inf
+
+        self.xml = min((diagnosis.corrected_xml, self.xml), key=error)
+        return {}
+
+    def update(self, policy, steps, seed, on_update=None):
+        """Line 4: what was found becomes the simulator."""
+        self._rebuild()
+        return {}
+
+    def _rebuild(self):
+        self.sim, self.transformer = self._simulator(self.xml), identity
+
+    def _simulator(self, xml):
+        """The task in the world of an MJCF, or in the raw simulator's if there is none yet."""
+        if not xml:
+            return self.nominal
+        model = mujoco.MjModel.from_xml_string(xml)
+        return BatchEnv(
+            self.nominal.env_id,
+            self.nominal.num_envs,
+            model=model,
+            nthread=self.nominal.batch.nthread,
+        )
+
+    def state(self):
+        return {"corrected_xml": self.xml}
+
+    def load(self, state):
+        self.xml = state["corrected_xml"]
+        self._rebuild()
+
+
+def recordings_of(env, transitions):
+    """Transitions as Recordings, one per episode. What the observation leaves out or clips counts as not measured."""
+    task, nq, nv = env.task, env.model.nq, env.model.nv
+    first = np.flatnonzero(np.r_[True, (transitions.s[1:] != transitions.s_next[:-1]).any(axis=1)])
+    recordings = []
+    for k, rows in enumerate(np.split(np.arange(len(transitions)), first[1:])):
+        obs = np.concatenate((transitions.s[rows], transitions.s_next[rows[-1:]])).astype(float)
+        qpos = np.full((len(obs), nq), np.nan)
+        qpos[:, task.skip_root_x :] = obs[:, : nq - task.skip_root_x]
+        qvel = obs[:, -nv:]
+        qvel = np.where(np.abs(qvel) < task.clip_velocity, qvel, np.nan)
+        # the last row has no action of its own: nothing is predicted from it
+        ctrl = transitions.a[np.r_[rows, rows[-1]]].astype(float)
+        recordings.append(Recording(f"episode {k}", env.dt * np.arange(len(obs)), qpos, qvel, ctrl))
+    return recordings

@@ -1,0 +1,369 @@
+"""A run on disk: settings, tables, checkpoints, figure and animation; everything is written whole or not at all.
+
+And what is seen of it meanwhile: the progress bar.
+"""
+
+import csv
+import hashlib
+import io
+import json
+import os
+import platform
+import time
+import zipfile
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
+from tqdm import tqdm
+
+from diagnosis.common.atomic_files import write_table, write_whole
+from models import GaussianPolicy, load_checkpoint
+
+PROGRESS = (
+    "grounding_step real_transitions sim_steps real_return_deterministic real_return_deterministic_se "
+    "real_return_stochastic forward_model_error at_one_step_error identity_one_step_error delta_action_rms at_std kl seconds"
+).split()
+ALWAYS = [k for k in PROGRESS if k.startswith("real_")] + [
+    "grounding_step",
+    "sim_steps",
+    "seconds",
+]  # numbers in every row
+TRAIN = (
+    "grounding_step phase steps return reward kl surrogate_gain step_size line_search entropy explained_variance std"
+).split()
+
+
+class RunError(ValueError):
+    """A run folder that cannot be used as asked; the message says what to do instead."""
+
+
+def save_whole(path, tensors):
+    """torch.save in the manner of files.write_whole."""
+    data = io.BytesIO()
+    torch.save(tensors, data)
+    write_whole(path, data.getvalue())
+
+
+def versions():
+    """What the numbers of a run depend on besides its settings."""
+    packages = {package.__name__: package.__version__ for package in (mujoco, gymnasium, torch, np)}
+    sources = b"".join(
+        (Path(__file__).parents[1] / f"{name}.py").read_bytes()
+        for name in ("envs", "models", "trpo")
+    )
+    machine = f"{platform.machine()}, {os.cpu_count()} cores"
+    return {
+        "python": platform.python_version(),
+        **packages,
+        "machine": machine,
+        "learner": hashlib.sha256(sources).hexdigest()[:16],
+    }
+
+
+class Run:
+    """The folder of one run.
+
+    config.json (settings and versions), progress.csv (a row per grounding step), train.csv (a row per TRPO update),
+    step_NN.pt (checkpoints), real_NN.npz (the real transitions collected in step NN), policy.pt (the best policy so far
+    on real), best.json (that policy judged once more), lines.json (reference returns), progress.png, replay.gif if asked
+    for, and ENV-sim-KEY.pt or ENV-real-KEY.pt, policies trained from scratch, where no other folder keeps them.
+    """
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+        self.progress, self.train = [], []
+        self.lines = {}
+
+    @classmethod
+    def create(cls, folder, settings):
+        """A new folder for a run with these settings (a dict). Raises RunError if it holds a run or cannot be made."""
+        run = cls(folder)
+        try:
+            if (run.folder / "config.json").exists():
+                raise RunError(
+                    f"{folder} already holds a run: continue it with --resume {folder}, or choose another --out"
+                )
+            run.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RunError(
+                f"cannot make the folder {folder}: {error.strerror}; choose another --out"
+            ) from None
+        write_whole(
+            run.folder / "config.json",
+            json.dumps({"settings": settings, "versions": versions()}, indent=1),
+        )
+        return run
+
+    @classmethod
+    def open(cls, folder):
+        """An existing run, cut back to its last whole grounding step. Returns it and its settings."""
+        run = cls(folder)
+        try:
+            config = json.loads((run.folder / "config.json").read_text())
+            settings = config["settings"]
+            run.progress = run._read("progress.csv")
+            for row in run.progress:
+                [float(row[k]) for k in ALWAYS]
+            done = len(run.progress)
+            run.train = [
+                row for row in run._read("train.csv") if int(row["grounding_step"]) < max(done, 1)
+            ]
+            if (run.folder / "lines.json").exists():
+                lines = json.loads((run.folder / "lines.json").read_text())
+                run.lines = {"trained on real": float(lines["trained on real"])}
+        except FileNotFoundError:
+            raise RunError(
+                f"{folder} holds no run (no config.json): name the --out folder of an earlier run"
+            ) from None
+        except (ValueError, KeyError, TypeError, OSError):
+            raise RunError(
+                f"{folder}: its config.json or tables are damaged: start a new run"
+            ) from None
+        return run, settings
+
+    def _read(self, name):
+        path = self.folder / name
+        return list(csv.DictReader(path.open(newline=""))) if path.exists() else []
+
+    def log_update(self, grounding_step, phase, stats):
+        """Keep a row of train.csv; flush() writes it."""
+        self.train.append({"grounding_step": grounding_step, "phase": phase, **stats})
+
+    def flush(self):
+        """Bring train.csv and the figure up to date."""
+        write_table(self.folder / "train.csv", TRAIN, self.train)
+        self.plot()
+
+    def record(self, row, checkpoint, real=None):
+        """Finish a grounding step: its data and checkpoint first, its progress row last, so that a row means a whole step."""
+        step = row["grounding_step"]
+        if real is not None:
+            data = io.BytesIO()
+            np.savez(data, s=real.s, a=real.a, s_next=real.s_next)
+            write_whole(self.folder / f"real_{step:02d}.npz", data.getvalue())
+        save_whole(self.folder / f"step_{step:02d}.pt", checkpoint)
+        best = max([float(r["real_return_deterministic"]) for r in self.progress], default=-np.inf)
+        if row["real_return_deterministic"] > best:
+            save_whole(self.folder / "policy.pt", checkpoint["acting"])
+        self.progress.append({k: row.get(k, "") for k in PROGRESS})
+        write_table(self.folder / "train.csv", TRAIN, self.train)
+        write_table(self.folder / "progress.csv", PROGRESS, self.progress)
+        self.plot()
+
+    def checkpoint(self, step):
+        """What record() saved for a step. Raises RunError if it is missing or damaged."""
+        try:
+            return load_checkpoint(self.folder / f"step_{step:02d}.pt")
+        except ValueError as error:
+            raise RunError(f"{error}; start a new run") from None
+
+    def policy(self):
+        """The best policy so far. Raises RunError if there is none yet, or its file is missing or damaged."""
+        if not self.progress:
+            raise RunError(f"{self.folder} has no policy yet: go on with --resume {self.folder}")
+        try:
+            return GaussianPolicy.load(self.folder / "policy.pt")
+        except ValueError as error:
+            raise RunError(f"{self.folder}: {error}; start a new run") from None
+
+    def real(self, step):
+        """The arrays s, a, s_next collected in a step. Raises RunError if they are missing or damaged."""
+        path = self.folder / f"real_{step:02d}.npz"
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                return data["s"], data["a"], data["s_next"]
+        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+            raise RunError(
+                f"{path} is missing or damaged ({type(error).__name__}): start a new run"
+            ) from None
+
+    def set_lines(self, **lines):
+        """Remember the reference returns drawn as horizontal lines."""
+        self.lines.update(lines)
+        write_whole(self.folder / "lines.json", json.dumps(self.lines, indent=1))
+
+    def plot(self):
+        """progress.png: return on real against grounding step, and the training returns behind it."""
+        figure = Figure(figsize=(10, 4), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        steps = [int(r["grounding_step"]) for r in self.progress]
+        mean = np.array([float(r["real_return_deterministic"]) for r in self.progress])
+        se = np.array([float(r["real_return_deterministic_se"]) for r in self.progress])
+        if steps:
+            left.errorbar(
+                steps,
+                mean,
+                se,
+                color="#1f5fa8",
+                marker="o",
+                capsize=3,
+                label="on real, deterministic",
+            )
+            stochastic = [float(r["real_return_stochastic"]) for r in self.progress]
+            left.plot(steps, stochastic, color="#1f5fa8", ls=":", label="on real, stochastic")
+        for name, value in self.lines.items():
+            left.axhline(value, color="#2e8b57", lw=1.2, label=name)
+        if steps:
+            left.axhline(mean[0], color="#c0392b", lw=1.2, label="before grounding")
+        left.set(xlabel="grounding step", ylabel="return on real")
+        left.xaxis.get_major_locator().set_params(integer=True)
+        if left.get_legend_handles_labels()[0]:
+            left.legend(fontsize=8)
+        rows = [
+            r
+            for r in self.train
+            if r["phase"] != "transformer" and str(r["return"]) not in ("", "nan")
+        ]
+        offset, last, x = 0, 0, []
+        for row in rows:  # steps restart with every phase
+            offset += last if int(row["steps"]) < last else 0
+            last = int(row["steps"])
+            x.append(offset + last)
+        right.plot(x, [float(r["return"]) for r in rows], color="#666666", lw=1)
+        right.set(xlabel="steps of policy improvement", ylabel="return in training (stochastic)")
+        image = io.BytesIO()
+        figure.savefig(image, format="png", dpi=110)
+        write_whole(self.folder / "progress.png", image.getvalue())
+
+
+class Bar:
+    """Progress on a terminal, train.csv and the figure along the way, and the steps and seconds of each grounding step."""
+
+    def __init__(self, s, run):
+        self.run, self.seen, self.drawn, self.clock = run, 0, time.monotonic(), time.monotonic()
+        self.world = "real" if s.algo == "real" else "sim"
+        at_steps = s.at_steps * (s.algo == "rgat")
+        total = (
+            s.pretrain_steps
+            + s.reference_steps * (s.algo != "real")
+            + s.grounding_steps * (s.policy_steps + at_steps)
+        )
+        self.tqdm = tqdm(
+            total=total,
+            unit="step",
+            unit_scale=True,
+            disable=None,
+            dynamic_ncols=True,
+            smoothing=0.05,
+        )
+
+    def phase(self, step, name):
+        """An on_update callback for one phase of one grounding step."""
+        before = 0
+
+        def on_update(stats):
+            nonlocal before
+            new, before = stats["steps"] - before, stats["steps"]
+            self.seen += new * (name != "reference")
+            self.tqdm.update(new)
+            self.tqdm.set_description(f"step {step}, {name}, return {stats['return']:.0f}")
+            self.run.log_update(step, name, stats)
+            if time.monotonic() - self.drawn > 20:
+                self.run.flush()
+                self.drawn = time.monotonic()
+
+        return on_update
+
+    def skip(self, steps, counts=True):
+        """Steps that an earlier run has done; counts: they are this run's own, not a reference line's."""
+        self.seen += steps * counts
+        for count in (
+            ("initial", "n", "last_print_n") if not self.tqdm.disable else ()
+        ):  # they tell nothing about the speed
+            setattr(self.tqdm, count, getattr(self.tqdm, count) + steps)
+
+    def lap(self):
+        """(environment steps, seconds) since the last lap."""
+        steps, seconds = self.seen, time.monotonic() - self.clock
+        self.seen, self.clock = 0, time.monotonic()
+        return steps, seconds
+
+    def say(self, line):
+        self.tqdm.write(line)
+
+
+# --- replay: the planar robots drawn from their geoms, with no need of OpenGL ------------------------
+
+
+SIZE, SCALE = (400, 300), 110  # of a frame in pixels, and pixels per metre
+MOST, EVERY = 500, 4  # steps shown, and steps per frame
+
+
+def draw(model, data, x, title):
+    """One frame: every capsule of the model projected on the x-z plane, the camera at x."""
+    image = Image.new("RGB", SIZE, "#f7f7f4")
+    pen = ImageDraw.Draw(image)
+    to_pixel = lambda p: (SIZE[0] / 2 + SCALE * (p[0] - x), SIZE[1] * 0.82 - SCALE * p[2])
+    ground = to_pixel((0, 0, 0))[1]
+    pen.rectangle((0, ground, *SIZE), fill="#dcd9cf")
+    for mark in np.arange(np.floor(x) - 3, x + 4, 0.5):
+        pen.line((to_pixel((mark, 0, 0)), (to_pixel((mark, 0, 0))[0], ground + 6)), fill="#8f8b80")
+    for geom in range(model.ngeom):
+        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
+            continue
+        radius, half = model.geom_size[geom, :2]
+        axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * half
+        ends = [to_pixel(data.geom_xpos[geom] + sign * axis) for sign in (-1, 1)]
+        color = "#8f8b80" if model.geom_bodyid[geom] == 0 else "#1f5fa8"
+        pen.line(ends, fill=color, width=max(1, round(2 * radius * SCALE)))
+        for px, pz in ends:
+            r = radius * SCALE
+            pen.ellipse((px - r, pz - r, px + r, pz + r), fill=color)
+    pen.text((8, 6), title, fill="#222222")
+    return image
+
+
+def animate(policy, worlds, path):
+    """A GIF of a policy acting in each of the worlds {title: BatchEnv with one environment}, side by side.
+
+    Each world stops moving when its episode ends. Returns the returns reached within MOST steps, by title.
+    """
+    strips, returns = [], {}
+    for title, env in worlds.items():
+        obs, _ = env.reset(seed=0)
+        data, frames, total, ended = mujoco.MjData(env.model), [], 0.0, False
+        for step in range(MOST):
+            if step % EVERY == 0:
+                if not ended:
+                    data.qpos[:] = env.qpos[0]
+                    mujoco.mj_kinematics(env.model, data)
+                x = 0.0 if not env.task.skip_root_x else data.qpos[0]
+                frames.append(
+                    draw(
+                        env.model,
+                        data,
+                        x,
+                        f"{title}: return {total:.0f}{', fallen' if ended else ''}",
+                    )
+                )
+            if not ended:
+                with torch.no_grad():
+                    action = policy.mean(torch.from_numpy(obs.astype(np.float32))).numpy()
+                box = env.single_action_space
+                obs, reward, terminated, truncated, _ = env.step(np.clip(action, box.low, box.high))
+                total, ended = total + float(reward[0]), bool(terminated[0] or truncated[0])
+        strips.append(frames)
+        returns[title] = total
+    frames = []
+    for parts in zip(*strips):
+        frame = Image.new("RGB", (sum(p.width for p in parts), parts[0].height))
+        for i, part in enumerate(parts):
+            frame.paste(part, (i * part.width, 0))
+        frames.append(frame.quantize(64))
+    env = next(iter(worlds.values()))
+    gif = io.BytesIO()
+    frames[0].save(
+        gif,
+        "GIF",
+        save_all=True,
+        append_images=frames[1:],
+        loop=0,
+        duration=max(20, int(1000 * env.dt * EVERY)),
+    )
+    write_whole(path, gif.getvalue())
+    return returns
