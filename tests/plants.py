@@ -188,7 +188,7 @@ def dropped(seed, damping):
     )
 
 
-PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="arm"><joint name="pivot" axis="0 1 0" damping="{damping}"/>
+DRIVEN_PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="arm"><joint name="pivot" axis="0 1 0" damping="{damping}"/>
   <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="{mass}" contype="0" conaffinity="0"/></body></worldbody>
   <actuator><motor name="drive" joint="pivot"/></actuator></mujoco>"""
 
@@ -201,7 +201,7 @@ def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=N
     push(time, qpos, qvel): torque that no catalogue knows of.
     """
     rng = np.random.default_rng(seed)
-    model = mujoco.MjModel.from_xml_string(PENDULUM.format(damping=damping, mass=mass))
+    model = mujoco.MjModel.from_xml_string(DRIVEN_PENDULUM.format(damping=damping, mass=mass))
     model.opt.timestep /= finer
     data = mujoco.MjData(model)
     rows, period, phase = round(seconds / 0.01), rng.uniform(0.6, 1.2, 3), rng.uniform(0, 6, 3)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from plants import NOISE, PENDULUM, recorded
+from plants import DRIVEN_PENDULUM, NOISE, recorded
 
 from diagnosis.estimation import initial_states, multiple_shooting, residuals
 from diagnosis.estimation import windows as cut
@@ -18,7 +18,7 @@ DAMPING = 0.15  # N·m·s/rad, of the real pendulum
 
 def fitted(ratio, effects):
     """(problem, fit of these effects): the real pendulum only has more damping, and its recording's time is `ratio` times true."""
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     run = recorded("run.csv", 0, damping=DAMPING)
     problem = residuals.Problem(
         world,

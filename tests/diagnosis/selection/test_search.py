@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import DROP, NOISE, PENDULUM, commanded, dropped, recorded
+from plants import DRIVEN_PENDULUM, DROP, NOISE, commanded, dropped, recorded
 
 from diagnosis import findings
 from diagnosis.effects.base import Candidate, Parameter
@@ -31,7 +31,7 @@ FREE = """<mujoco><worldbody><body><freejoint name="f"/><geom size=".1"/>
 
 
 def diagnosed(**hidden):
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     runs = [recorded(f"run{i}.csv", i, **hidden) for i in range(3)]
     return identify(world, runs[:2], runs[2:])
 
@@ -87,7 +87,7 @@ def test_windows_tile_the_recording(rows, sample, jitter, seed):
 
 def test_error_is_that_of_stock_mujoco():
     run = recorded("run.csv", 5, mass=0.7)
-    xml = PENDULUM.format(damping=0.05, mass=0.5)
+    xml = DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)
     world = World(mujoco.MjSpec.from_string(xml))
     error, channels = prediction_error.prediction_error(world, {}, [run], np.array([NOISE]))
     assert error == pytest.approx(stock_error(xml, run, NOISE), rel=1e-6)
@@ -96,7 +96,7 @@ def test_error_is_that_of_stock_mujoco():
 
 def test_windows_that_blow_up_are_counted_beside_the_curve():
     run = recorded("run.csv", 5)
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     true, noise = world.simulate, np.array([NOISE])
 
     def bursts(
@@ -119,7 +119,7 @@ def test_windows_that_blow_up_are_counted_beside_the_curve():
 def test_the_curve_goes_by_time_whatever_the_sampling():
     """Of recordings of different rates, against a plain loop over windows and their nearest rows."""
     world, noise = (
-        World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.5, mass=0.5))),
+        World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.5, mass=0.5))),
         np.array([NOISE]),
     )
     fast, uneven = (
@@ -151,7 +151,7 @@ def test_the_curve_goes_by_time_whatever_the_sampling():
 
 
 def test_floor_is_what_noise_does_to_a_perfect_simulator():
-    xml = PENDULUM.format(damping=0.05, mass=0.5)
+    xml = DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)
     runs, world = (
         [recorded(f"run{k}.csv", 20 + k, seconds=20.0) for k in range(6)],
         World(mujoco.MjSpec.from_string(xml)),
@@ -217,7 +217,7 @@ def test_p_values_hold_under_correlated_residuals():
 
 
 def test_noise_is_that_of_the_recordings_that_measured_it():
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     runs = [recorded(f"run{k}.csv", k) for k in range(3)]
     alone = cut.measurement_noise(world.model, runs[:1])[0]
     for run in runs[1:]:
@@ -226,7 +226,7 @@ def test_noise_is_that_of_the_recordings_that_measured_it():
 
 
 def test_every_other_position_still_has_probes_for_friction():
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     candidate, run = (
         world.candidate("stribeck_friction", "pivot"),
         recorded("run.csv", 1, noise=0.0),
@@ -238,7 +238,7 @@ def test_every_other_position_still_has_probes_for_friction():
 
 def test_values_for_windows_are_those_that_other_recordings_say():
     runs = [recorded(f"run{k}.csv", k, damping=0.08) for k in range(4)]
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     noise, windows = np.array([NOISE]), [w for r in runs[1:] for w in cut.consecutive(r, 0.3)]
     problem = residuals.Problem(
         world, [w for r in runs[:3] for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf])
@@ -276,7 +276,7 @@ def test_intervals_allow_for_a_finer_step_where_the_data_do():
     width = {}
     for finer in (1, 8):
         runs = [recorded(f"run{k}.csv", k, damping=0.06, finer=finer) for k in range(4)]
-        world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+        world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
         problem = residuals.Problem(
             world,
             [w for r in runs for w in cut.consecutive(r, 0.5)],
@@ -296,7 +296,7 @@ def test_intervals_allow_for_a_finer_step_where_the_data_do():
 
 
 def test_each_of_a_dozen_recordings_is_a_cluster():
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     for number in (11, 13, 20):
         runs = [recorded(f"run{k}.csv", k, seconds=1.0) for k in range(number)]
         problem = residuals.Problem(
@@ -311,7 +311,7 @@ def test_each_of_a_dozen_recordings_is_a_cluster():
 
 def test_what_was_not_seen_at_one_fit_is_looked_at_again_at_the_next():
     runs = [recorded(f"run{k}.csv", k, damping=0.08) for k in range(2)]
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     problem = residuals.Problem(
         world,
         [w for r in runs for w in cut.consecutive(r, 0.5)],
@@ -334,7 +334,7 @@ def loaded(seed, lasting, carried, between, seconds=4.0):
     """A run of the pendulum, `lasting` times as heavy as nominal, for a while `carried` times."""
     rng = np.random.default_rng(seed)
     models = [
-        mujoco.MjModel.from_xml_string(PENDULUM.format(damping=0.05, mass=0.5 * ratio))
+        mujoco.MjModel.from_xml_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5 * ratio))
         for ratio in (lasting, carried)
     ]
     data, rows = mujoco.MjData(models[0]), round(seconds / 0.01)
@@ -358,7 +358,7 @@ def loaded(seed, lasting, carried, between, seconds=4.0):
 
 def test_a_load_on_top_of_a_lasting_one_is_placed_in_time():
     world, run = (
-        World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5))),
+        World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5))),
         loaded(2, 3.0, 4.0, (1.6, 2.4)),
     )
     problem = residuals.Problem(
@@ -374,7 +374,7 @@ def test_a_load_on_top_of_a_lasting_one_is_placed_in_time():
 
 def test_an_effect_that_does_not_predict_other_recordings_better_goes():
     runs = [recorded(f"run{k}.csv", k, damping=0.08) for k in range(4)]
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     noise, windows = np.array([NOISE]), [w for r in runs for w in cut.consecutive(r, 0.3)]
     problem = residuals.Problem(
         world, [w for r in runs for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf])
@@ -394,7 +394,7 @@ def test_alternatives_are_refitted_and_listed_where_they_predict_as_well():
         recorded(f"run{k}.csv", k, damping=0.08, push=lambda time, qpos, qvel: 0.03)
         for k in range(3)
     ]
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     noise = np.array([NOISE])
     problem = residuals.Problem(
         world, [w for r in runs for w in cut.consecutive(r, 0.5)], noise, np.array([np.inf])
@@ -424,7 +424,7 @@ def test_alternatives_are_refitted_and_listed_where_they_predict_as_well():
 
 def test_what_stands_in_a_curves_place_brings_its_equals_along():
     runs = [recorded(f"run{k}.csv", k, damping=0.1) for k in range(2)]
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     problem = residuals.Problem(
         world,
         [w for r in runs for w in cut.consecutive(r, 0.2)],
@@ -490,7 +490,7 @@ def test_what_a_motor_at_a_site_depends_on_is_no_joint():
 
 def test_start_states_and_damping_are_recovered_without_noise():
     run = recorded("run.csv", 2, damping=0.08, noise=0.0)
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     problem = residuals.Problem(
         world, cut.consecutive(run, 0.5), np.array([1e-4]), np.array([np.inf])
     )
@@ -508,7 +508,7 @@ def test_start_states_and_damping_are_recovered_without_noise():
 
 def test_updated_start_jacobians_serve_as_well_as_fresh_ones():
     run = recorded("run.csv", 4, damping=0.2)
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     problem = residuals.Problem(
         world, cut.consecutive(run, 0.5), np.array([NOISE]), np.array([np.inf])
     )
@@ -548,7 +548,7 @@ def test_projection_is_least_squares_on_the_start_states(pieces):
 
 
 def test_a_coarser_curve_is_a_sum_of_the_finer():
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     for number in (4, 5, 11):
         finest = world.curve(
             "pivot", "velocity:pivot", np.sort(np.random.default_rng(number).normal(size=number))
@@ -613,7 +613,7 @@ def test_seldom_and_mostly_unmeasured_rows_can_be_solved():
         run.name, run.time[::3], run.qpos[::3].copy(), run.qvel[::3], run.ctrl[::3], {}
     )
     seldom.qpos[:80] = np.nan
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     problem = residuals.Problem(
         world, cut.consecutive(seldom, 0.2), np.array([NOISE]), np.array([np.inf])
     )
@@ -685,7 +685,7 @@ def test_far_values_are_looked_at_where_a_fit_leaves_much():
     )
 
 
-FINE = PENDULUM.replace("0.005", "0.00125").format(damping=0.05, mass=0.5)
+FINE = DRIVEN_PENDULUM.replace("0.005", "0.00125").format(damping=0.05, mass=0.5)
 
 
 def rubbed(seed, coulomb, static, velocity, rows=250):
@@ -792,7 +792,7 @@ def test_parameters_are_moved_inside_their_bounds_and_never_hardly(cases):
 
 
 def test_nothing_missing_is_a_match():
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     runs = [
         recorded(f"run{k}.csv", k, seconds=4.0 if k < 2 else 40.0) for k in range(3)
     ]  # an error in noise is itself chance
@@ -842,7 +842,7 @@ def test_what_no_catalogue_knows_is_called_unknown():
     assert end == pytest.approx(max(r.qpos.max() for r in diagnosis.train), abs=0.05)
 
 
-SERVO = PENDULUM.format(damping=0.05, mass=0.5).replace(
+SERVO = DRIVEN_PENDULUM.format(damping=0.05, mass=0.5).replace(
     '<motor name="drive" joint="pivot"/>', '<position name="drive" joint="pivot" kp="20" kv="0.6"/>'
 )
 
@@ -908,7 +908,7 @@ def test_what_acts_at_high_speed_alone_is_found_and_no_event(speed, drag):
 )
 def test_several_effects_of_a_joint_give_way_to_one_that_does_as_well(push, names):
     world, runs = (
-        World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5))),
+        World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5))),
         [recorded(f"run{i}.csv", i, push=push) for i in range(2)],
     )
     problem = residuals.Problem(
@@ -977,12 +977,12 @@ def test_a_region_holds_all_of_the_force_or_is_not_told(seed):
 
 
 def unknown_force(knots, variable="position:pivot"):
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     return world.curve("pivot", variable, knots).effect
 
 
 def test_a_push_for_a_while_is_placed_in_time():
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, mass=0.5)))
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     runs = [
         recorded("calm.csv", 0),
         recorded("pushed.csv", 1, push=lambda time, q, v: 0.5 * (1.5 < time < 2.5)),
