@@ -1,0 +1,340 @@
+"""A trial: robots, what is hidden between them, the experiment, the folder that a tool gets.
+
+    trial = draw_trial(key=(1, 7), settings=DEVELOPMENT)
+    write_folder(trial, Path("bench"))       # sim.xml, train_0.csv, train_1.csv, …
+
+Everything follows from the key and the settings, so that anyone can draw the same trial again.
+"""
+
+import csv
+import io
+import json
+from dataclasses import asdict, dataclass, field, replace
+
+import mujoco
+import numpy as np
+
+from diagnosis.common.atomic_files import write_together
+from diagnosis.trials import hiding
+from diagnosis.trials.experiment import Plan, channel_noise, record
+from diagnosis.trials.hiding import Usage
+from diagnosis.trials.laws import Gate
+from diagnosis.trials.prediction import model_error, system_error
+from diagnosis.trials.robots import Robot, draw_robot, loguniform, to_mjcf
+from diagnosis.trials.truth import TrueSystem
+
+KINDS = ("null", "single", "unknown", "pair", "many")
+SHARES = (0.25, 0.33, 0.2, 0.14, 0.08)
+ATTEMPTS = 30
+MOST_NOISE = 4e-3  # rad
+AGREEMENT = 0.5  # noise: most that the nominal integrator may be away from the true one
+
+
+@dataclass(frozen=True)
+class Trial:
+    """answer: JSON-able dict of everything hidden and its conditions; the rest is for scoring.
+
+    nominal, true: Robots; laws: of the true one; items: hiding.Item each; owners: for each law the
+    index of its item; train, held_out: Runs; noise (nv,): true standard deviation per dof.
+    """
+
+    answer: dict
+    nominal: Robot
+    true: Robot
+    laws: list = field(repr=False)
+    items: list
+    owners: list
+    changes: list = field(repr=False)
+    train: list = field(repr=False)
+    held_out: list = field(repr=False)
+    noise: np.ndarray
+
+    def system(self):
+        """The true machine, new."""
+        return TrueSystem(self.true, self.laws)
+
+    def without(self, index):
+        """(TrueSystem, kept laws' indices): the true machine with item `index` as in the nominal."""
+        kept = [k for k, owner in enumerate(self.owners) if owner != index]
+        true = self.nominal
+        for k, change in enumerate(self.changes):
+            if k != index:
+                true = change(true)
+        return TrueSystem(true, [self.laws[k] for k in kept]), kept
+
+
+class Unfit(Exception):
+    """A draw that no experiment can be made with; the next attempt is drawn."""
+
+
+def draw_trial(key, settings):
+    """The Trial of a key, a tuple of integers. Raises RuntimeError after too many unfit draws."""
+    kind = str(np.random.default_rng([*key, 0]).choice(KINDS, p=SHARES))
+    for attempt in range(ATTEMPTS):
+        try:
+            return _attempt(np.random.default_rng([*key, 1, attempt]), kind, settings, attempt)
+        except Unfit:
+            continue
+    raise RuntimeError(f"trial {key}: no sane experiment in {ATTEMPTS} attempts")
+
+
+def _attempt(rng, kind, settings, attempt):
+    robot = draw_robot(rng, settings)
+    plan = draw_plan(rng, settings)
+    noise = channel_noise(robot, plan.noise)
+    usage = observe(robot, plan, rng)
+    robot, plan = _agree(robot, plan, noise, rng)
+    noise = channel_noise(robot, plan.noise)
+    chosen = choose(rng, kind, robot)
+    target = loguniform(rng, *settings.size_over_noise)
+    nominal, true, laws, items, owners, changes = robot, robot, [], [], [], []
+    for effect, spot in chosen:
+        seed = int(rng.integers(2**31))
+        removed = effect in hiding.REMOVABLE and rng.random() < 0.55
+        size = _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target)
+        make = lambda n, t: hiding.hide(
+            effect, spot, size, removed, n, t, usage, np.random.default_rng(seed)
+        )
+        nominal, true, more, item = make(nominal, true)
+        changes.append((effect, spot, item.parameters))
+        owners += [len(items)] * len(more)
+        laws += _gate(rng, more, plan, settings) if kind == "single" else more
+        items.append(item)
+    setters = [_setter(effect, spot, values) for effect, spot, values in changes]
+    system = TrueSystem(true, laws)
+    train, held_out = [], []
+    for number in range(settings.train_runs + settings.held_out_runs):
+        run = record(system, plan, rng, number)
+        if run is None:
+            raise Unfit
+        (train if number < settings.train_runs else held_out).append(run)
+    trial = Trial({}, nominal, true, laws, items, owners, setters, train, held_out, noise)
+    return replace(trial, answer=_answer(trial, kind, plan, target, attempt, settings))
+
+
+def draw_plan(rng, settings):
+    """The conditions of the recordings."""
+    return Plan(
+        row=float(rng.choice(settings.row_seconds)),
+        level=str(rng.choice(("gentle", "brisk", "violent"), p=(0.25, 0.5, 0.25))),
+        feedback=str(rng.choice(("closed", "open"), p=(0.75, 0.25))),
+        noise=loguniform(rng, *settings.noise),
+        noise_kind=str(rng.choice(("white", "coloured", "quantised"), p=(0.6, 0.2, 0.2))),
+        velocities=str(rng.choice(("none", "noisy", "filtered"), p=(0.6, 0.25, 0.15))),
+        stamps=str(rng.choice(("regular", "irregular", "jitter"), p=(0.8, 0.1, 0.1))),
+        missing=float(rng.choice((0.0, 0.03), p=(0.9, 0.1))),
+        seconds=settings.run_seconds,
+    )
+
+
+def observe(robot, plan, rng):
+    """Usage of a robot: one recording without anything hidden. Raises Unfit."""
+    system = TrueSystem(robot)
+    run = record(system, replace(plan, missing=0.0), rng, states=False)
+    if run is None:
+        raise Unfit
+    data = mujoco.MjData(system.model)
+    loads, mobility, torques = [], [], []
+    for row in range(0, len(run.time), 5):
+        data.qpos[:], data.qvel[:] = run.true_qpos[row], run.true_qvel[row]
+        mujoco.mj_forward(system.model, data)
+        inverse = np.zeros((system.model.nv,) * 2)
+        mujoco.mj_solveM(system.model, data, inverse, np.eye(system.model.nv))
+        mobility.append(np.diag(inverse).copy())
+        bias = np.zeros(len(robot.links))
+        bias[system.jointed] = data.qfrc_bias[system.dof[system.jointed]]
+        system.q[system.jointed] = run.true_qpos[row][system.address[system.jointed]]
+        system.v[system.jointed] = run.true_qvel[row][system.dof[system.jointed]]
+        torque = np.zeros(len(robot.links))
+        push = system.feed * run.ctrl[row] + system.bias
+        push = push - system.stiff * system.q[system.driven] - system.slow * system.v[system.driven]
+        torque[system.driven] = np.clip(push, -system.most, system.most)
+        torques.append(np.abs(torque))
+        loads.append(np.maximum(np.abs(torque), np.abs(bias)))
+    count = len(robot.links)
+    inertia, spread, speed = (np.full(count, np.nan) for _ in range(3))
+    quantiles = np.full((count, 101), np.nan)
+    for i in system.jointed:
+        inertia[i] = 1 / np.mean(mobility, 0)[system.dof[i]]
+        q = run.true_qpos[:, system.address[i]]
+        spread[i], quantiles[i] = q.std() + 1e-4, np.quantile(q, np.linspace(0, 1, 101))
+        speed[i] = np.sqrt(np.mean(run.true_qvel[:, system.dof[i]] ** 2)) + 1e-3
+    return Usage(
+        spread,
+        speed,
+        np.sqrt(np.mean(np.square(loads), 0)) + 1e-9,
+        inertia,
+        quantiles,
+        np.quantile(torques, np.linspace(0, 1, 101), axis=0).T,
+        np.sqrt(np.mean(np.square(run.ctrl), 0)) + 1e-9,
+    )
+
+
+def _agree(robot, plan, noise, rng):
+    """(robot, plan) whose nominal integrator follows the true one to within AGREEMENT × the noise.
+
+    The nominal step is halved at most once; what is left is met by noisier sensors.
+    """
+    run = record(TrueSystem(robot), replace(plan, seconds=1.5, missing=0.0), rng)
+    if run is None:
+        raise Unfit
+    for halving in range(2):
+        error = integration_error(robot, run, noise)
+        if error <= AGREEMENT:
+            return robot, plan
+        if not halving:
+            robot = replace(robot, step=robot.step / 2)
+    noisier = plan.noise * error / AGREEMENT
+    if noisier > MOST_NOISE:
+        raise Unfit
+    return robot, replace(plan, noise=noisier)
+
+
+def integration_error(robot, run, noise):
+    """How far the nominal model's integrator alone moves predictions, over the noise."""
+    model = mujoco.MjModel.from_xml_string(to_mjcf(robot))
+    exact = replace(run, qpos=run.true_qpos, qvel=run.true_qvel, time=run.stamps)
+    return model_error(model, model, [exact], noise)
+
+
+def choose(rng, kind, robot):
+    """[(effect, Spot)] to hide; every effect that this robot offers is equally likely."""
+    count = {"null": 0, "single": 1, "unknown": 1, "pair": 2, "many": int(rng.integers(3, 5))}[kind]
+    names = hiding.UNNAMED if kind == "unknown" else (*hiding.FIELDS, *hiding.LAWS)
+    offers = {name: hiding.places(robot, name) for name in names}
+    offers = {name: spots for name, spots in offers.items() if spots}
+    if len(offers) < count:
+        raise Unfit
+    rotors = ("backlash", "joint_elasticity")
+    effects = [str(e) for e in rng.choice(sorted(offers), count, replace=False)]
+    if sum(e in rotors for e in effects) > 1:
+        raise Unfit
+    chosen = []
+    for effect in effects:
+        spot = offers[effect][rng.integers(len(offers[effect]))]
+        chosen.append((effect, replace(spot, sign=float(rng.choice((-1, 1))))))
+    return chosen
+
+
+def _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target):
+    """Relative size at which the effect alone moves predictions by about `target` × the noise."""
+    size, moved = 0.1, 0.0
+    for _ in range(4):
+        rng = np.random.default_rng(seed)
+        nominal, true, laws, _ = hiding.hide(effect, spot, size, removed, robot, robot, usage, rng)
+        brief = replace(plan, seconds=1.3, missing=0.0)
+        run = record(TrueSystem(true, laws), brief, np.random.default_rng(seed))
+        if run is None:
+            size /= 4
+            continue
+        moved = system_error(TrueSystem(nominal), [run], noise, perfect=True, kept=())
+        if 0.6 * target < moved < 1.6 * target:
+            break
+        size = float(np.clip(size * np.clip(target / max(moved, 1e-9), 0.2, 6.0), 1e-3, 1.0))
+    if moved < 1.0:
+        raise Unfit
+    return size
+
+
+def _setter(effect, spot, values):
+    """A function that gives a Robot this item's true values; laws change no Robot."""
+    if effect not in hiding.FIELDS:
+        return lambda robot: robot
+    return lambda robot: hiding._set_field(effect, spot, robot, values)
+
+
+def _gate(rng, laws, plan, settings):
+    """In some trials a law acts from some moment on only, or in one recording of several."""
+    fate = rng.random()
+    gateable = all(getattr(type(k), "control") is getattr(hiding.L.Law, "control") for k in laws)
+    gateable = gateable and all(
+        getattr(type(k), "measure") is getattr(hiding.L.Law, "measure") for k in laws
+    )
+    gateable = gateable and not any(isinstance(k, hiding.L.Transmission) for k in laws)
+    if not laws or not gateable or fate > 0.16:
+        return laws
+    if fate < 0.08:
+        return [Gate(law, start=float(rng.uniform(0.3, 0.6) * plan.seconds)) for law in laws]
+    which = int(rng.integers(settings.train_runs))
+    others = range(settings.train_runs, settings.train_runs + settings.held_out_runs)
+    return [Gate(law, runs=(which, *others)) for law in laws]
+
+
+def _answer(trial, kind, plan, target, attempt, settings):
+    """The JSON-able answer of a trial, with the sizes over the noise in both sets of recordings."""
+    sizes = {}
+    for name in ("train", "held_out"):
+        sizes[name] = [
+            round(system_error(*_apart(trial, index, name)), 4) for index in range(len(trial.items))
+        ]
+    links = trial.true.links
+    gates = [k for k in trial.laws if isinstance(k, Gate)]
+    return {
+        "kind": kind,
+        "hidden": [item.to_json() for item in trial.items],
+        "over_noise": sizes["train"],
+        "over_noise_held_out": sizes["held_out"],
+        "target": round(target, 4),
+        "attempt": attempt,
+        "plan": asdict(plan),
+        "settings": settings.name,
+        "joints": len(links),
+        "slides": sum(k.joint == "slide" for k in links),
+        "free_base": links[0].joint == "free",
+        "contact": trial.true.ground,
+        "stops": any(k.range for k in links),
+        "passive": len(links) - len(trial.true.actuators) - (links[0].joint == "free"),
+        "step": trial.nominal.step,
+        "integrator": trial.nominal.integrator,
+        "gate": None if not gates else "one recording" if gates[0].runs else "from a moment on",
+    }
+
+
+def _apart(trial, index, name):
+    system, kept = trial.without(index)
+    return system, getattr(trial, name), trial.noise, True, kept
+
+
+# the folder
+
+
+def write_folder(trial, folder):
+    """Write sim.xml and the training recordings into `folder`; returns their names."""
+    model = mujoco.MjModel.from_xml_string(to_mjcf(trial.nominal))
+    files = {folder / "sim.xml": to_mjcf(trial.nominal)}
+    names = []
+    for run in trial.train:
+        names.append(f"train_{run.number}.csv")
+        files[folder / names[-1]] = to_csv(run, model)
+    write_together(files)
+    return names
+
+
+def to_csv(run, model):
+    """One Run as the contract's CSV text."""
+    header, columns = ["time"], [run.time]
+    for index in range(model.njnt):
+        joint = model.joint(index)
+        q, v = joint.qposadr[0], joint.dofadr[0]
+        free = model.jnt_type[index] == mujoco.mjtJoint.mjJNT_FREE
+        tags = lambda n: [f":{k}" for k in range(n)] if free else [""]
+        for k, tag in enumerate(tags(7)):
+            header.append(f"qpos:{joint.name}{tag}")
+            columns.append(run.qpos[:, q + k])
+        if np.isfinite(run.qvel).all():
+            for k, tag in enumerate(tags(6)):
+                header.append(f"qvel:{joint.name}{tag}")
+                columns.append(run.qvel[:, v + k])
+    for k in range(model.nu):
+        header.append(f"ctrl:{model.actuator(k).name}")
+        columns.append(run.ctrl[:, k])
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(header)
+    writer.writerows([f"{value:.9g}" for value in row] for row in np.column_stack(columns))
+    return text.getvalue()
+
+
+def answer_text(answer):
+    """The answer as one line of JSON, the same for the same answer."""
+    return json.dumps(answer, sort_keys=True)

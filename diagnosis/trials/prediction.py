@@ -1,0 +1,133 @@
+"""The contract's Error, by stock MuJoCo and by the true system, without any code of the diagnosis.
+
+before = model_error(nominal, nominal, runs, noise)     # of a model's file
+floor = system_error(system, runs, noise)               # of the truth, from the same noisy starts
+moved = system_error(without, runs, noise, perfect=True)  # how far a hidden item moves the motion
+"""
+
+import mujoco
+import numpy as np
+
+HORIZON = 0.3  # s
+
+
+def windows(time):
+    """[(first row, last row)] of consecutive windows; one ends where the next begins; a stump is dropped."""
+    found, first = [], 0
+    while True:
+        last = int(np.searchsorted(time, time[first] + HORIZON * (1 + 1e-9), side="right")) - 1
+        if last <= first or last == len(time) - 1 and time[last] < time[first] + 0.9 * HORIZON:
+            return found
+        found.append((first, last))
+        first = last
+
+
+def start_velocity(model, run, row):
+    """qvel (nv,) at a row: as measured, else the central difference of the measured positions."""
+    if np.isfinite(run.qvel[row]).all():
+        return run.qvel[row]
+    before, after = max(row - 1, 0), min(row + 1, len(run.time) - 1)
+    return difference(model, run.qpos[before], run.qpos[after]) / (
+        run.time[after] - run.time[before]
+    )
+
+
+def difference(model, qpos, other):
+    """other − qpos in the tangent space (nv,): rad and m."""
+    out = np.empty(model.nv)
+    mujoco.mj_differentiatePos(model, out, 1.0, qpos, other)
+    return out
+
+
+def rms(values):
+    """Root mean square; inf where a simulation blew up."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        value = float(np.sqrt(np.mean(np.square(values))))
+    return value if np.isfinite(value) else float("inf")
+
+
+def recorded_addresses(nominal, model):
+    """(qpos, dof) addresses in `model` of the nominal model's joints, found by name."""
+    qpos, dof = [], []
+    for index in range(nominal.njnt):
+        own = nominal.joint(index)
+        joint = model.joint(own.name)
+        wide = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+        q, v = wide.get(nominal.jnt_type[index], (1, 1))
+        qpos += range(joint.qposadr[0], joint.qposadr[0] + q)
+        dof += range(joint.dofadr[0], joint.dofadr[0] + v)
+    return np.array(qpos), np.array(dof)
+
+
+def model_error(nominal, model, runs, noise, step=None):
+    """The Error of a stock MuJoCo `model` over Runs, in units of `noise`, one or per dof (nv,).
+
+    Joints and actuators go by the names of `nominal`; what `model` appends runs on by itself.
+    step(model, data): does one step instead of mj_step, for forces that MJCF cannot hold.
+    """
+    q, v = recorded_addresses(nominal, model)
+    drives = [model.actuator(nominal.actuator(k).name).id for k in range(nominal.nu)]
+    differences, length = [], model.opt.timestep
+    for run in runs:
+        data = mujoco.MjData(model)
+        spans = windows(run.time)
+        starts = {first for first, _ in spans}
+        end = max((last for _, last in spans), default=0)
+        for row in range(end + 1):
+            if row:
+                differences.append(difference(nominal, run.qpos[row], data.qpos[q]) / noise)
+            if row in starts:
+                data.qpos[q], data.qvel[v] = run.qpos[row], start_velocity(nominal, run, row)
+            if row < end:
+                data.ctrl[drives] = run.ctrl[row]
+                gap = run.time[row + 1] - run.time[row]
+                steps = max(1, round(gap / length))
+                model.opt.timestep = gap / steps
+                if step is None:
+                    mujoco.mj_step(model, data, steps)
+                else:
+                    for _ in range(steps):
+                        step(model, data)
+    model.opt.timestep = length
+    return rms(differences)
+
+
+def system_error(system, runs, noise, perfect=False, kept=None):
+    """Error of a TrueSystem over Runs of a machine with the same laws, in units of `noise`.
+
+    perfect: started from what noiseless sensors read, compared with what they read later: what
+    this system's physics alone does not explain. Otherwise from the noisy start that the contract
+    prescribes, with the true memory: the floor of the Error.
+    kept: for a system that lacks some laws, the indices of those it has.
+    """
+    differences = []
+    model = system.model
+    for run in runs:
+        system.run = run.number
+        for first, last in windows(run.time):
+            qpos, qvel, time, memory = run.states[first]
+            if kept is not None:
+                memory = [memory[k] for k in kept]
+            system.restore((qpos, qvel, time, memory))
+            wanted = run.true_qpos[first], run.true_qvel[first]
+            if not perfect:
+                wanted = run.qpos[first], start_velocity(model, run, first)
+            move_reading(system, *wanted)
+            for row in range(first, last):
+                system.advance(run.ctrl[row], run.stamps[row + 1] - run.stamps[row])
+                goal = run.true_qpos if perfect else run.qpos
+                differences.append(difference(model, goal[row + 1], system.reading()[0]) / noise)
+    return rms(differences)
+
+
+def move_reading(system, qpos, qvel):
+    """Shift a system's state by what its sensors' reading lacks of qpos (nq,), qvel (nv,)."""
+    read_q, read_v = system.reading()
+    system._look()
+    inner_q, inner_v = system.data.qpos.copy(), system.data.qvel.copy()
+    jointed = system.jointed
+    inner_q[system.address[jointed]] = system.q[jointed]
+    inner_v[system.dof[jointed]] = system.v[jointed]
+    shift = difference(system.model, read_q, qpos)
+    mujoco.mj_integratePos(system.model, inner_q, shift, 1.0)
+    system.place(inner_q, inner_v + qvel - read_v)

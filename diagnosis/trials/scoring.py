@@ -1,0 +1,224 @@
+"""The rules of the benchmark: findings against the hidden truth, one to one.
+
+    score = score_findings(answer, findings)
+    score.strict                # first name or declared class, nothing false, values within 5 %
+
+A finding is an entry of diagnosis.json's "findings"; an answer is `drawing.Trial.answer`.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+TOLERANCE = 0.05  # of a true value, or of its change from the nominal one
+LONGEST_CLASS = 3  # names that a finding may give besides its own
+MOST_VARIABLES = 3  # that an `unknown` may claim to depend on
+NOISE = 1.0  # an effect below this many times the noise need not be found
+
+
+@dataclass(frozen=True)
+class Match:
+    """One hidden item and what was said of it.
+
+    finding: its index or None; first: its own name is right; listed: a name in also_possible is;
+    class_size: names given besides the first; values: ValueScore of each parameter compared.
+    """
+
+    item: int
+    finding: int | None
+    first: bool = False
+    listed: bool = False
+    class_size: int = 0
+    values: tuple = ()
+
+
+@dataclass(frozen=True)
+class ValueScore:
+    """A parameter of a matched finding: truth, reported value, its nominal and its interval."""
+
+    name: str
+    truth: float
+    value: float | None
+    nominal: float | None
+    low: float | None
+    high: float | None
+
+    @property
+    def near(self):
+        """Within 5 % of the truth."""
+        if self.value is None or not math.isfinite(self.value):
+            return False
+        return abs(self.value - self.truth) <= TOLERANCE * abs(self.truth)
+
+    @property
+    def held(self):
+        """Is the truth inside the interval? None where none was given."""
+        if self.low is None or self.high is None:
+            return None
+        return self.low <= self.truth <= self.high
+
+
+@dataclass(frozen=True)
+class Score:
+    """matches: one per hidden item; false: indices of findings that claim what is not there.
+
+    neutral: findings that are neither: time_step beside a right one, wrong nominal values put right.
+    """
+
+    matches: tuple
+    false: tuple
+    neutral: tuple
+    needed: tuple = field(default=())  # items that must be found
+
+    @property
+    def found(self):
+        """Needed items that are named or in a declared class."""
+        return sum(self.matches[k].finding is not None for k in self.needed)
+
+    @property
+    def first(self):
+        """Needed items that are named by a finding's own name."""
+        return sum(self.matches[k].first for k in self.needed)
+
+    @property
+    def valued(self):
+        """Needed items whose every compared value is within 5 %."""
+        return sum(
+            self.matches[k].finding is not None and all(v.near for v in self.matches[k].values)
+            for k in self.needed
+        )
+
+    @property
+    def strict(self):
+        """All that is needed found, with right values, and no false claim."""
+        return not self.false and self.found == self.valued == len(self.needed)
+
+
+def score_findings(answer, findings, seen=None):
+    """Score findings against an answer; seen: per item, whether the training data can show it.
+
+    Without `seen`, an item counts as needed where it moves the training recordings by more than
+    the noise. Items that are not needed may be found all the same.
+    """
+    hidden = answer["hidden"]
+    if seen is None:
+        seen = [size > NOISE for size in answer["over_noise"]]
+    pairing = assign(hidden, findings)
+    matches, taken = [], set()
+    for index, item in enumerate(hidden):
+        finding = pairing.get(index)
+        if finding is None:
+            matches.append(Match(index, None))
+            continue
+        taken.add(finding)
+        matches.append(_match(index, item, finding, findings[finding]))
+    rest = [k for k in range(len(findings)) if k not in taken]
+    neutral = [k for k in rest if taken and findings[k]["effect"] == "time_step"]
+    false = [k for k in rest if k not in neutral]
+    needed = tuple(k for k, item in enumerate(hidden) if seen[k] and item["required"])
+    return Score(tuple(matches), tuple(false), tuple(neutral), needed)
+
+
+def assign(hidden, findings):
+    """{hidden index: finding index}: one to one, as many first names as possible, then listed ones."""
+    if not hidden or not findings:
+        return {}
+    worth = np.zeros((len(hidden), len(findings)))
+    for i, item in enumerate(hidden):
+        for k, finding in enumerate(findings):
+            if names(finding, item):
+                worth[i, k] = 1000.0 - 0.01 * k
+            elif listed(finding, item):
+                worth[i, k] = 100.0 - 0.01 * k
+    rows, columns = linear_sum_assignment(-worth)
+    return {int(i): int(k) for i, k in zip(rows, columns) if worth[i, k] > 0}
+
+
+def names(finding, item):
+    """Is this finding's own name, place and (for unknown) variables that of the hidden item?"""
+    if finding["effect"] != item["effect"] or not same_place(finding["place"], item["place"]):
+        return False
+    if item["effect"] != "unknown":
+        return True
+    told = finding.get("depends_on") or []
+    return len(told) <= MOST_VARIABLES and set(item["needs"]) <= {_plain(t) for t in told}
+
+
+def listed(finding, item):
+    """Is the hidden item among the at most three that the finding also holds possible?"""
+    others = finding.get("also_possible") or []
+    return any(names({**finding, **other}, item) for other in others[:LONGEST_CLASS])
+
+
+def same_place(place, other):
+    """Do two places agree? Two joints "a+b" may stand in either order."""
+    parts = lambda p: sorted(str(p["name"]).split("+"))
+    kinds = {place["kind"], other["kind"]}
+    alike = len(kinds) == 1 or ("+" in str(other["name"]) and kinds <= {"joint", "joints"})
+    return alike and parts(place) == parts(other)
+
+
+def _plain(variable):
+    """A variable without the component that a surface over two of them may add."""
+    return str(variable).split("[")[0]
+
+
+def _match(index, item, finding_index, finding):
+    first = names(finding, item)
+    others = (finding.get("also_possible") or [])[:LONGEST_CLASS]
+    source = finding
+    if not first:
+        source = next(other for other in others if names({**finding, **other}, item))
+    values = () if item["effect"] == "unknown" else compare_values(item, source)
+    return Match(index, finding_index, first, not first, len(others), values)
+
+
+def compare_values(item, finding):
+    """ValueScores of the parameters that a hidden item and a finding share by name.
+
+    Vectors are compared whole, by the component farthest off relative to the vector's length; where
+    truth and report have one number each, these are compared whatever their names.
+    """
+    told = {p["name"]: p for p in finding.get("parameters") or []}
+    truth = {k: v for k, v in item["parameters"].items() if isinstance(v, int | float)}
+    if len(told) == 1 and len(truth) == 1:
+        told = {next(iter(truth)): next(iter(told.values()))}
+    if set(truth) in ({"x", "y", "z"}, {"ixx", "iyy", "izz"}):
+        return tuple(_vector_scores(truth, told))
+    return tuple(
+        ValueScore(
+            name,
+            float(value),
+            told[name].get("value") if name in told else None,
+            told[name].get("nominal") if name in told else None,
+            told[name].get("low") if name in told else None,
+            told[name].get("high") if name in told else None,
+        )
+        for name, value in truth.items()
+        if name in told or len(truth) == 1
+    )
+
+
+class _Component(ValueScore):
+    """A component of a vector, judged by the vector's length."""
+
+    scale = 0.0
+
+    @property
+    def near(self):
+        if self.value is None or not math.isfinite(self.value):
+            return True  # a component that the recordings do not show may be left out
+        return abs(self.value - self.truth) <= TOLERANCE * self.scale
+
+
+def _vector_scores(truth, told):
+    scale = math.sqrt(sum(v * v for v in truth.values()))
+    for name, value in truth.items():
+        p = told.get(name, {})
+        score = _Component(
+            name, float(value), p.get("value"), p.get("nominal"), p.get("low"), p.get("high")
+        )
+        object.__setattr__(score, "scale", scale)
+        yield score
