@@ -1,7 +1,7 @@
-"""Sealed blind trials of the diagnosis. See diagnosis/trials/command.py.
+"""The public benchmark of hidden physics. See diagnosis/trials/command.py.
 
 python prove.py show --seed 1 --trial 15 --folder /tmp/t15
-python prove.py run --seed 1 --trials 40 --out results/proof_dev.csv
+python prove.py run --development --seed 1 --trials 60 --out results/development.csv
 """
 
 from diagnosis.trials.command import main

@@ -22,8 +22,8 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
 from diagnosis.trials.drawing import draw_trial, write_folder  # noqa: E402
-from diagnosis.trials.experiment import Run  # noqa: E402
 from diagnosis.trials.prediction import model_error, system_error  # noqa: E402
+from diagnosis.trials.replay import load_runs, replay, save_runs  # noqa: E402
 from diagnosis.trials.robots import DEVELOPMENT  # noqa: E402
 from diagnosis.trials.scoring import score_findings  # noqa: E402
 from diagnosis.trials.tools import run_tool  # noqa: E402
@@ -32,29 +32,21 @@ COLUMNS = (
     "trial kind joints level hidden over_noise verdict said exit first found needed false strict "
     "error_before error_after error_floor cpu_seconds steps note"
 ).split()
-FIELDS = ("time", "ctrl", "qpos", "qvel")
 
 
 def cached(seed, number, cache):
-    """(folder with sim.xml and recordings, answer, held-out Runs) of a trial, drawn at first use."""
+    """(its folder, with bench/ for the tool; the answer) of a trial, drawn at first use."""
     folder = Path(cache) / f"{seed}_{number}"
     if not (folder / "answer.json").exists():
         folder.mkdir(parents=True, exist_ok=True)
         trial = draw_trial((seed, number), DEVELOPMENT)
         (folder / "bench").mkdir(exist_ok=True)
         write_folder(trial, folder / "bench")
-        for k, run in enumerate(trial.held_out):
-            np.savez(folder / f"held_out_{k}.npz", **{f: getattr(run, f) for f in FIELDS})
+        save_runs(folder / "held_out.npz", trial.held_out, trial.noise)
         floor = system_error(trial.system(), trial.held_out, trial.noise)
         answer = trial.answer | {"error_floor": floor, "noise": trial.noise.tolist()}
         (folder / "answer.json").write_text(json.dumps(answer))
-    runs = []
-    for path in sorted(folder.glob("held_out_*.npz")):
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {f: data[f] for f in FIELDS}
-        blank = np.empty(0)
-        runs.append(Run(**arrays, true_qpos=blank, true_qvel=blank, stamps=blank, states=[]))
-    return folder / "bench", json.loads((folder / "answer.json").read_text()), runs
+    return folder, json.loads((folder / "answer.json").read_text())
 
 
 def place(item):
@@ -76,7 +68,8 @@ def said(finding):
 
 def run_trial(template, seed, number, cache, limit):
     """One row of the table."""
-    bench, answer, held_out = cached(seed, number, cache)
+    folder, answer = cached(seed, number, cache)
+    bench = folder / "bench"
     shutil.rmtree(bench / "report", ignore_errors=True)
     names = sorted(path.name for path in bench.glob("train_*.csv"))
     done = run_tool(template, bench, names, limit)
@@ -84,12 +77,8 @@ def run_trial(template, seed, number, cache, limit):
     findings = summary["findings"] if summary else []
     score = score_findings(answer, findings)
     nominal = mujoco.MjModel.from_xml_path(str(bench / "sim.xml"))
-    noise = np.array(answer["noise"])
-    try:
-        corrected = mujoco.MjModel.from_xml_path(str(done.report / "corrected.xml"))
-        after = model_error(nominal, corrected, held_out, noise)
-    except (ValueError, KeyError):
-        after = float("nan")
+    held_out, noise = load_runs(folder / "held_out.npz")
+    after = replay(bench / "sim.xml", done.report, folder / "held_out.npz")
     return {
         "trial": number,
         "kind": answer["kind"],
@@ -161,7 +150,7 @@ def main():
     template = f"{{python}} {script} --model {{model}} --recordings {{recordings}} --out {{out}}"
     rows = []
     for number in numbers:
-        _, answer, _ = cached(options.seed, number, options.cache)
+        _, answer = cached(options.seed, number, options.cache)
         if options.draw or options.kinds and answer["kind"] not in options.kinds.split(","):
             continue
         rows.append(run_trial(template, options.seed, number, options.cache, options.limit))

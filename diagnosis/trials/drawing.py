@@ -16,9 +16,11 @@ import numpy as np
 
 from diagnosis.common.atomic_files import write_together
 from diagnosis.trials import hiding
+from diagnosis.trials.disguise import disguise
 from diagnosis.trials.experiment import Plan, channel_noise, record
 from diagnosis.trials.hiding import Usage
 from diagnosis.trials.laws import Gate
+from diagnosis.trials.oracle import visibility
 from diagnosis.trials.prediction import model_error, system_error
 from diagnosis.trials.robots import Robot, draw_robot, loguniform, to_mjcf
 from diagnosis.trials.truth import TrueSystem
@@ -81,35 +83,78 @@ def draw_trial(key, settings):
 def _attempt(rng, kind, settings, attempt):
     robot = draw_robot(rng, settings)
     plan = draw_plan(rng, settings)
-    noise = channel_noise(robot, plan.noise)
     usage = observe(robot, plan, rng)
-    robot, plan = _agree(robot, plan, noise, rng)
-    noise = channel_noise(robot, plan.noise)
-    chosen = choose(rng, kind, robot)
+    robot, plan = _agree(robot, plan, channel_noise(robot, plan.noise), rng)
+    mimic = kind == "pair" and rng.random() < 0.4
+    chosen = choose(rng, kind, robot, mimic)
     target = loguniform(rng, *settings.size_over_noise)
-    nominal, true, laws, items, owners, changes = robot, robot, [], [], [], []
-    for effect, spot in chosen:
-        seed = int(rng.integers(2**31))
-        removed = effect in hiding.REMOVABLE and rng.random() < 0.55
-        size = _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target)
-        make = lambda n, t: hiding.hide(
-            effect, spot, size, removed, n, t, usage, np.random.default_rng(seed)
-        )
-        nominal, true, more, item = make(nominal, true)
-        changes.append((effect, spot, item.parameters))
-        owners += [len(items)] * len(more)
-        laws += _gate(rng, more, plan, settings) if kind == "single" else more
-        items.append(item)
-    setters = [_setter(effect, spot, values) for effect, spot, values in changes]
-    system = TrueSystem(true, laws)
+    trial = _hide_all(rng, kind, settings, robot, plan, usage, chosen, target)
     train, held_out = [], []
+    system = trial.system()
     for number in range(settings.train_runs + settings.held_out_runs):
         run = record(system, plan, rng, number)
         if run is None:
             raise Unfit
         (train if number < settings.train_runs else held_out).append(run)
-    trial = Trial({}, nominal, true, laws, items, owners, setters, train, held_out, noise)
-    return replace(trial, answer=_answer(trial, kind, plan, target, attempt, settings))
+    trial = replace(trial, train=train, held_out=held_out)
+    fitted = kind != "null" and trial.answer["gate"] is None and rng.random() < 0.2
+    if fitted:
+        trial = _disguised(trial)
+    answer = _answer(trial, kind, plan, settings) | {
+        "target": round(target, 4),
+        "attempt": attempt,
+        "mimic": bool(mimic),
+        "fitted_without": any(not item.required for item in trial.items),
+        "motorless": _motorless(chosen),
+    }
+    trial = replace(trial, answer=answer)
+    shown = [visibility(trial, k) for k, item in enumerate(trial.items) if item.required]
+    more = {
+        "alone": [s.alone for s in shown],
+        "apart": [s.apart for s in shown],
+        "visible": [s.visible for s in shown],
+        "distinct": [s.distinct for s in shown],
+    }
+    return replace(trial, answer=answer | more)
+
+
+def _hide_all(rng, kind, settings, robot, plan, usage, chosen, target):
+    """The Trial before anything is recorded; its answer holds the gate and the plan only."""
+    noise = channel_noise(robot, plan.noise)
+    nominal, true, laws, items, owners, setters = robot, robot, [], [], [], []
+    for effect, spot in chosen:
+        seed = int(rng.integers(2**31))
+        removed = effect in hiding.REMOVABLE and rng.random() < 0.55
+        size = _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target)
+        fresh = np.random.default_rng(seed)
+        nominal, true, more, item = hiding.hide(
+            effect, spot, size, removed, nominal, true, usage, fresh
+        )
+        setters.append(_setter(effect, spot, item.parameters))
+        owners += [len(items)] * len(more)
+        alone = kind in ("single", "unknown")
+        laws += _gate(rng, more, plan, settings, usage) if alone else more
+        items.append(item)
+    answer = {"gate": _gate_name(laws), "plan": asdict(plan)}
+    return Trial(answer, nominal, true, laws, items, owners, setters, [], [], noise)
+
+
+def _disguised(trial):
+    """The Trial with nominal values fitted by someone who did not know of what is hidden."""
+    nominal, wrong = disguise(trial.nominal, trial.true, trial.items, trial.train, trial.noise)
+    index = {k.name: i for i, k in enumerate(nominal.links)}
+    index |= {k.joint_name: i for i, k in enumerate(nominal.links)}
+    right = [
+        _setter(item.effect, hiding.Spot(index[item.place["name"]]), item.parameters)
+        for item in wrong
+    ]
+    return replace(trial, nominal=nominal, items=trial.items + wrong, changes=trial.changes + right)
+
+
+def _motorless(chosen):
+    """Is something hidden in a joint without a drive?"""
+    bare = {*hiding.OF_BODIES, *hiding.OF_WORLD, *hiding.OF_GROUND}
+    return any(spot.actuator < 0 and effect not in bare for effect, spot in chosen)
 
 
 def draw_plan(rng, settings):
@@ -197,23 +242,45 @@ def integration_error(robot, run, noise):
     return model_error(model, model, [exact], noise)
 
 
-def choose(rng, kind, robot):
-    """[(effect, Spot)] to hide; every effect that this robot offers is equally likely."""
+def choose(rng, kind, robot, mimic=False):
+    """[(effect, Spot)] to hide; every effect that this robot offers is equally likely.
+
+    mimic: two effects at one place that pass for each other.
+    """
     count = {"null": 0, "single": 1, "unknown": 1, "pair": 2, "many": int(rng.integers(3, 5))}[kind]
     names = hiding.UNNAMED if kind == "unknown" else (*hiding.FIELDS, *hiding.LAWS)
     offers = {name: hiding.places(robot, name) for name in names}
     offers = {name: spots for name, spots in offers.items() if spots}
+    if mimic:
+        return _mimics(rng, offers)
     if len(offers) < count:
         raise Unfit
-    rotors = ("backlash", "joint_elasticity")
     effects = [str(e) for e in rng.choice(sorted(offers), count, replace=False)]
-    if sum(e in rotors for e in effects) > 1:
+    if sum(e in ("backlash", "joint_elasticity") for e in effects) > 1:
+        raise Unfit
+    if kind != "single" and "payload_change" in effects:  # it needs its moment
         raise Unfit
     chosen = []
     for effect in effects:
         spot = offers[effect][rng.integers(len(offers[effect]))]
         chosen.append((effect, replace(spot, sign=float(rng.choice((-1, 1))))))
     return chosen
+
+
+def _mimics(rng, offers):
+    """Two effects of hiding.MIMICS at the same link. Raises Unfit."""
+    both = [
+        (a, spot, b, other)
+        for a, b in hiding.MIMICS
+        for spot in offers.get(a, ())
+        for other in offers.get(b, ())
+        if spot.link == other.link
+    ]
+    if not both:
+        raise Unfit
+    a, spot, b, other = both[rng.integers(len(both))]
+    sign = lambda: float(rng.choice((-1, 1)))
+    return [(a, replace(spot, sign=sign())), (b, replace(other, sign=sign()))]
 
 
 def _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target):
@@ -238,45 +305,67 @@ def _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target):
 
 def _setter(effect, spot, values):
     """A function that gives a Robot this item's true values; laws change no Robot."""
-    if effect not in hiding.FIELDS:
+    if effect not in hiding.FIELDS and effect != hiding.WRONG_AXIS:
         return lambda robot: robot
-    return lambda robot: hiding._set_field(effect, spot, robot, values)
+    return lambda robot: hiding.set_field(effect, spot, robot, values)
 
 
-def _gate(rng, laws, plan, settings):
-    """In some trials a law acts from some moment on only, or in one recording of several."""
+def _gate(rng, laws, plan, settings, usage):
+    """In some trials a law acts from some moment on, in one recording, or in part of the travel."""
     fate = rng.random()
-    gateable = all(getattr(type(k), "control") is getattr(hiding.L.Law, "control") for k in laws)
-    gateable = gateable and all(
-        getattr(type(k), "measure") is getattr(hiding.L.Law, "measure") for k in laws
-    )
-    gateable = gateable and not any(isinstance(k, hiding.L.Transmission) for k in laws)
-    if not laws or not gateable or fate > 0.16:
+    train, runs = settings.train_runs, settings.train_runs + settings.held_out_runs
+    start = float(rng.uniform(0.3, 0.6) * plan.seconds)
+    some = (int(rng.integers(train)), *range(train, runs))
+    if laws and isinstance(laws[0], hiding.L.Payload):  # one that never changes is a mass
+        laws[0].__dict__.update({"start": start} if fate < 0.5 else {"runs": some})
         return laws
-    if fate < 0.08:
-        return [Gate(law, start=float(rng.uniform(0.3, 0.6) * plan.seconds)) for law in laws]
-    which = int(rng.integers(settings.train_runs))
-    others = range(settings.train_runs, settings.train_runs + settings.held_out_runs)
-    return [Gate(law, runs=(which, *others)) for law in laws]
+    gates = ({"start": start}, {"runs": some})
+    if fate > 0.24 or not all(_gateable(law) for law in laws):
+        return laws
+    if fate < 0.16:
+        return [Gate(law, **gates[fate < 0.08]) for law in laws]
+    quantiles = [usage.quantiles[law.link] for law in laws]
+    if any(isinstance(law, (hiding.L.Air, hiding.L.ExternalForce)) for law in laws):
+        return laws
+    return [Gate(law, within=(float(q[25]), float(q[65]))) for law, q in zip(laws, quantiles)]
 
 
-def _answer(trial, kind, plan, target, attempt, settings):
+def _gateable(law):
+    """May a law come and go? Not what delays, measures, couples, or carries a rotor."""
+    base = hiding.L.Law
+    fixed = ("control", "measure", "couple")
+    same = all(getattr(type(law), name) is getattr(base, name) for name in fixed)
+    return same and not isinstance(law, hiding.L.Transmission)
+
+
+def _gate_name(laws):
+    """Which of the three, as a column says it; None where nothing comes and goes."""
+    for law in laws:
+        if isinstance(law, (Gate, hiding.L.Payload)):
+            if getattr(law, "within", None):
+                return "part of the travel"
+            return "one recording" if law.runs else "from a moment on"
+    return None
+
+
+def _answer(trial, kind, plan, settings):
     """The JSON-able answer of a trial, with the sizes over the noise in both sets of recordings."""
     sizes = {}
     for name in ("train", "held_out"):
-        sizes[name] = [
-            round(system_error(*_apart(trial, index, name)), 4) for index in range(len(trial.items))
-        ]
+        runs = getattr(trial, name)
+        runs = runs if trial.answer["gate"] == "one recording" else runs[:2]
+        sizes[name] = []
+        for index in range(len(trial.items)):
+            system, kept = trial.without(index)
+            error = system_error(system, runs, trial.noise, True, kept)
+            sizes[name].append(round(error, 4))
     links = trial.true.links
-    gates = [k for k in trial.laws if isinstance(k, Gate)]
     return {
+        **trial.answer,
         "kind": kind,
         "hidden": [item.to_json() for item in trial.items],
         "over_noise": sizes["train"],
         "over_noise_held_out": sizes["held_out"],
-        "target": round(target, 4),
-        "attempt": attempt,
-        "plan": asdict(plan),
         "settings": settings.name,
         "joints": len(links),
         "slides": sum(k.joint == "slide" for k in links),
@@ -286,13 +375,7 @@ def _answer(trial, kind, plan, target, attempt, settings):
         "passive": len(links) - len(trial.true.actuators) - (links[0].joint == "free"),
         "step": trial.nominal.step,
         "integrator": trial.nominal.integrator,
-        "gate": None if not gates else "one recording" if gates[0].runs else "from a moment on",
     }
-
-
-def _apart(trial, index, name):
-    system, kept = trial.without(index)
-    return system, getattr(trial, name), trial.noise, True, kept
 
 
 # the folder

@@ -82,6 +82,10 @@ FIELDS = (
     "gravity",
     "link_length",
     "joint_stop",
+    "contact_friction",
+    "contact_stiffness",
+    "contact_damping",
+    "ground_height",
 )
 REMOVABLE = tuple(name for name in FIELDS if name not in ("saturation", "joint_stop"))
 LAWS = (
@@ -98,6 +102,7 @@ LAWS = (
     "air_drag",
     "wind",
     "external_force",
+    "payload_change",
     "sensor_bias",
     "sensor_scale",
     "sensor_delay",
@@ -133,9 +138,39 @@ OF_DRIVES = (
     "cogging",
 )
 OF_PAIRS = ("coupled_friction", "coupled_inertia", "NeighbourSpring")
-OF_BODIES = ("mass", "inertia", "center_of_mass", "external_force", "link_length")
+OF_BODIES = (
+    "mass",
+    "inertia",
+    "center_of_mass",
+    "external_force",
+    "payload_change",
+    "link_length",
+)
+OF_GROUND = {
+    "contact_friction": ("sliding", "sliding"),
+    "contact_stiffness": ("contact_stiffness", "stiffness"),
+    "contact_damping": ("contact_damping", "damping"),
+    "ground_height": ("ground_height", "z"),
+}
+MIMICS = (
+    ("coulomb_friction", "viscous_damping"),
+    ("viscous_damping", "quadratic_damping"),
+    ("delay", "lag"),
+    ("joint_elasticity", "delay"),
+    ("stiffness", "nonlinear_stiffness"),
+    ("spring_offset", "coulomb_friction"),
+    ("gain", "servo_damping"),
+    ("mass", "armature"),
+    ("backlash", "dead_zone"),
+    ("saturation", "gain"),
+    ("torque_speed", "back_emf"),
+    ("sensor_delay", "delay"),
+    ("load_friction", "gain"),
+    ("sensor_bias", "stiffness"),
+)
 OF_WORLD = ("gravity", "wind", "air_drag")
-UNNAMED = tuple(law.__name__ for law in L.UNNAMED)
+WRONG_AXIS = "wrong_axis"
+UNNAMED = (*(law.__name__ for law in L.UNNAMED), WRONG_AXIS)
 
 
 def places(robot, effect):
@@ -144,6 +179,8 @@ def places(robot, effect):
     joints = [i for i, k in enumerate(robot.links) if k.joint != "free"]
     if effect in OF_WORLD:
         return [Spot(0)]
+    if effect in OF_GROUND:
+        return [Spot(0)] if robot.ground else []
     if effect in OF_PAIRS:
         return [
             Spot(i, drives.get(i, -1), robot.links[i].parent)
@@ -180,6 +217,8 @@ def hide(effect, spot, size, removed, nominal, true, usage, rng):
     """
     if effect in FIELDS:
         return _hide_field(effect, spot, size, removed, nominal, true, usage, rng)
+    if effect == WRONG_AXIS:
+        return _hide_axis(spot, size, nominal, true, rng)
     if effect in UNNAMED:
         law, needs = _unnamed(effect, spot, size, true, usage, rng)
         name = true.links[spot.link].joint_name
@@ -195,16 +234,31 @@ def hide(effect, spot, size, removed, nominal, true, usage, rng):
     return nominal, true, [law], Item(effect, place, parameters)
 
 
+def _hide_axis(spot, size, nominal, true, rng):
+    """A joint whose axis is not where the drawing has it."""
+    link = true.links[spot.link]
+    axis = np.array(link.axis)
+    across = np.cross(axis, rng.normal(size=3))
+    across /= np.linalg.norm(across)
+    angle = min(0.5 * size, 0.5)
+    turned = tuple((np.cos(angle) * axis + np.sin(angle) * across).tolist())
+    place = {"kind": "joint", "name": link.joint_name}
+    values = {"axis": turned}
+    true = set_field(WRONG_AXIS, spot, true, values)
+    return nominal, true, [], Item("unknown", place, {**values, "angle": angle}, law=WRONG_AXIS)
+
+
 def _hide_field(effect, spot, size, removed, nominal, true, usage, rng):
     """A field that differs between the two robots."""
     low, high, place = _field_values(effect, spot, size, true, usage, rng)
-    change = lambda robot, values: _set_field(effect, spot, robot, values)
+    change = lambda robot, values: set_field(effect, spot, robot, values)
     nominal_values, true_values = (high, low) if removed else (low, high)
     nominal, true = change(nominal, nominal_values), change(true, true_values)
     return nominal, true, [], Item(effect, place, true_values, removed=removed)
 
 
-def _set_field(effect, spot, robot, values):
+def set_field(effect, spot, robot, values):
+    """The Robot with an effect's field set to these values, named as the contract names them."""
     link = robot.links[spot.link]
     if effect == "mass":
         ratio = values["mass"] / link.mass
@@ -217,6 +271,10 @@ def _set_field(effect, spot, robot, values):
     if effect == "link_length":
         direction = np.array(link.position) / np.linalg.norm(link.position)
         return robot.with_link(spot.link, position=tuple(values["length"] * direction))
+    if effect == WRONG_AXIS:
+        return robot.with_link(spot.link, axis=values["axis"])
+    if effect in OF_GROUND:
+        return replace(robot, **{OF_GROUND[effect][0]: next(iter(values.values()))})
     if effect == "gravity":
         return replace(robot, gravity=tuple(values[k] for k in "xyz"))
     if effect == "joint_stop":
@@ -268,6 +326,14 @@ def _field_values(effect, spot, size, robot, usage, rng):
         side = max(0.01, 0.4 * min(size, 1))
         low, high = np.quantile(usage.quantiles[i], (side, 1 - side))
         return {"low": None, "high": None}, {"low": float(low), "high": float(high)}, joint
+    if effect in OF_GROUND:
+        field, name = OF_GROUND[effect]
+        base = getattr(robot, field)
+        lower = {"contact_friction": 1 / (1 + 2 * size)}.get(
+            effect, 1 + 2 * spot.sign * min(size, 0.4)
+        )
+        value = base + 0.03 * spot.sign * size if effect == "ground_height" else base * lower
+        return {name: base}, {name: float(value)}, {"kind": "geom", "name": "ground"}
     if effect == "armature":
         return {effect: link.armature}, {effect: link.armature + 2 * size * inertia}, joint
     if effect == "viscous_damping":
@@ -300,7 +366,7 @@ def _named_law(effect, spot, size, robot, usage, rng):
     load, speed, inertia = float(usage.load[i]), float(usage.speed[i]), float(usage.inertia[i])
     spread = float(usage.spread[i])
     amount, unit = size * load, lambda low, high: float(rng.uniform(low, high))
-    if effect in ("air_drag", "wind", "external_force"):
+    if effect in ("air_drag", "wind", "external_force", "payload_change"):
         return _surrounding(effect, spot, size, robot, usage, rng)
     if effect.startswith("sensor"):
         law = {
@@ -408,6 +474,10 @@ def _surrounding(effect, spot, size, robot, usage, rng):
         push = turn * size * float(np.nanmax(usage.load)) / link.length
         values = dict(zip("xyz", push.tolist()))
         return L.ExternalForce(i, **values), {"kind": "body", "name": link.name}, values
+    if effect == "payload_change":
+        added = 1.5 * size * link.mass
+        law = L.Payload(i, added=added, start=0.0, runs=None)
+        return law, {"kind": "body", "name": link.name}, {"mass": link.mass + added}
     if effect == "air_drag":
         density = 30.0 * size
         law = L.Air(0, density=density, x=0.0, y=0.0, z=0.0)

@@ -10,6 +10,7 @@ N·m or N. A law's `state` is what it remembers from one substep to the next.
 import copy
 from collections import deque
 
+import mujoco
 import numpy as np
 
 
@@ -25,9 +26,8 @@ class Law:
     needs = ()
 
     def __init__(self, link, **parameters):
-        self.link, self.parameters = link, parameters
+        self.link, self.parameters, self.state = link, parameters, None
         self.__dict__.update(parameters)
-        self.state = None
 
     def reset(self, s):
         """Forget, at the start of a recording."""
@@ -56,20 +56,29 @@ class Law:
 
 
 class Gate(Law):
-    """A law that acts only in some recordings, and there only from `start` on (s)."""
+    """A law that acts in some recordings only, from `start` on (s), or within a part of the travel.
+
+    runs: numbers of the recordings, None for all; within: (low, high) of the joint's position.
+    """
 
     HOOKS = ("drive", "force", "friction", "bodies")
 
-    def __init__(self, law, start=0.0, runs=None):
+    def __init__(self, law, start=0.0, runs=None, within=None):
+        self.law, self.start, self.runs, self.within = law, start, runs, within
         super().__init__(law.link, **law.parameters)
-        self.law, self.start, self.runs = law, start, runs
         self.effect, self.needs = law.effect, law.needs
         for name in self.HOOKS:
             setattr(self, name, self._gated(getattr(law, name)))
 
+    def acts(self, s):
+        """Does the law act now?"""
+        if s.time < self.start or (self.runs is not None and s.run not in self.runs):
+            return False
+        return self.within is None or self.within[0] <= s.q[self.link] <= self.within[1]
+
     def _gated(self, hook):
         def call(s, *more):
-            if s.time >= self.start and (self.runs is None or s.run in self.runs):
+            if self.acts(s):
                 hook(s, *more)
 
         return call
@@ -83,8 +92,7 @@ class Gate(Law):
 
     @state.setter
     def state(self, value):
-        if "law" in self.__dict__:
-            self.law.state = value
+        self.law.state = value
 
 
 # friction and damping that the catalogue names
@@ -358,14 +366,26 @@ class ExternalForce(Law):
         s.data.xfrc_applied[s.body[self.link], :3] += (self.x, self.y, self.z)
 
 
+class Payload(Law):
+    """A point mass hung at a body's centre of mass, from `start` on or in some recordings."""
+
+    effect = "payload_change"
+
+    def bodies(self, s):
+        there = s.time >= self.start and (self.runs is None or s.run in self.runs)
+        body, own = s.body[self.link], s.robot.links[self.link].mass
+        wanted = own + self.added if there else own
+        if s.model.body_mass[body] != wanted:
+            s.model.body_mass[body] = wanted
+            mujoco.mj_setConst(s.model, mujoco.MjData(s.model))
+
+
 class Air(Law):
     """Drag of air on the box of equal inertia of every body, beyond what the nominal model has."""
 
     effect = "air_drag"
 
     def bodies(self, s):
-        from diagnosis.trials.hidden_forces import drag
-
         wind = np.array([self.x, self.y, self.z])
         s.data.xfrc_applied[:] += drag(s.model, s.data, self.density, wind)
 
@@ -597,6 +617,38 @@ UNNAMED = (
     SagGain,
     BrakeDrag,
 )
+
+
+def drag(model, data, density, wind):
+    """Air drag on every body's box of equal inertia, as force and torque at its centre (nbody, 6).
+
+    Each face pair of area A meets the air at speed w: force -density A w |w| / 2 along its normal.
+    Spin: the same pressure over faces turning through the air, as MuJoCo's inertia-box model has it.
+    """
+    out = np.zeros((model.nbody, 6))
+    velocity = np.empty(6)
+    for body in range(1, model.nbody):
+        mass, inertia = model.body_mass[body], model.body_inertia[body]
+        if mass <= 0:
+            continue
+        total = inertia.sum()
+        box = np.sqrt(np.maximum(6 * (total - 2 * inertia) / mass, 0.0))  # full edge lengths
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
+        frame = data.ximat[body].reshape(3, 3)
+        spin = frame.T @ velocity[:3]
+        flow = frame.T @ (velocity[3:] - wind)
+        area = np.array([box[1] * box[2], box[0] * box[2], box[0] * box[1]])
+        force = -0.5 * density * area * np.abs(flow) * flow
+        lever = np.array(
+            [
+                box[0] * (box[1] ** 4 + box[2] ** 4),
+                box[1] * (box[0] ** 4 + box[2] ** 4),
+                box[2] * (box[0] ** 4 + box[1] ** 4),
+            ]
+        )
+        torque = -density * lever * np.abs(spin) * spin / 64
+        out[body, :3], out[body, 3:] = frame @ force, frame @ torque
+    return out
 
 
 def snapshot(laws):

@@ -11,12 +11,12 @@ import numpy as np
 HORIZON = 0.3  # s
 
 
-def windows(time):
+def windows(time, horizon=HORIZON):
     """[(first row, last row)] of consecutive windows; one ends where the next begins; a stump is dropped."""
     found, first = [], 0
     while True:
-        last = int(np.searchsorted(time, time[first] + HORIZON * (1 + 1e-9), side="right")) - 1
-        if last <= first or last == len(time) - 1 and time[last] < time[first] + 0.9 * HORIZON:
+        last = int(np.searchsorted(time, time[first] + horizon * (1 + 1e-9), side="right")) - 1
+        if last <= first or last == len(time) - 1 and time[last] < time[first] + 0.9 * horizon:
             return found
         found.append((first, last))
         first = last
@@ -65,19 +65,31 @@ def model_error(nominal, model, runs, noise, step=None):
     Joints and actuators go by the names of `nominal`; what `model` appends runs on by itself.
     step(model, data): does one step instead of mj_step, for forces that MJCF cannot hold.
     """
+    return rms(model_residuals(nominal, model, runs, noise, step=step))
+
+
+def model_residuals(nominal, model, runs, noise, horizon=HORIZON, step=None, shift=None):
+    """Predicted minus recorded positions over the noise, (rows, nv), rows of all Runs in turn.
+
+    shift: (dq, dv), (nv,) each, added to every window's start.
+    """
     q, v = recorded_addresses(nominal, model)
     drives = [model.actuator(nominal.actuator(k).name).id for k in range(nominal.nu)]
-    differences, length = [], model.opt.timestep
+    out, length = [], model.opt.timestep
     for run in runs:
         data = mujoco.MjData(model)
-        spans = windows(run.time)
+        spans = windows(run.time, horizon)
         starts = {first for first, _ in spans}
         end = max((last for _, last in spans), default=0)
         for row in range(end + 1):
             if row:
-                differences.append(difference(nominal, run.qpos[row], data.qpos[q]) / noise)
+                out.append(difference(nominal, run.qpos[row], data.qpos[q]) / noise)
             if row in starts:
-                data.qpos[q], data.qvel[v] = run.qpos[row], start_velocity(nominal, run, row)
+                qpos, qvel = run.qpos[row].copy(), start_velocity(nominal, run, row)
+                if shift is not None:
+                    mujoco.mj_integratePos(nominal, qpos, shift[0], 1.0)
+                    qvel = qvel + shift[1]
+                data.qpos[q], data.qvel[v] = qpos, qvel
             if row < end:
                 data.ctrl[drives] = run.ctrl[row]
                 gap = run.time[row + 1] - run.time[row]
@@ -89,7 +101,7 @@ def model_error(nominal, model, runs, noise, step=None):
                     for _ in range(steps):
                         step(model, data)
     model.opt.timestep = length
-    return rms(differences)
+    return np.array(out).reshape(-1, nominal.nv)
 
 
 def system_error(system, runs, noise, perfect=False, kept=None):
@@ -100,11 +112,16 @@ def system_error(system, runs, noise, perfect=False, kept=None):
     prescribes, with the true memory: the floor of the Error.
     kept: for a system that lacks some laws, the indices of those it has.
     """
-    differences = []
+    return rms(system_residuals(system, runs, noise, perfect, kept))
+
+
+def system_residuals(system, runs, noise, perfect=False, kept=None, horizon=HORIZON):
+    """Predicted minus recorded (perfect: minus true) positions over the noise, (rows, nv)."""
+    out = []
     model = system.model
     for run in runs:
         system.run = run.number
-        for first, last in windows(run.time):
+        for first, last in windows(run.time, horizon):
             qpos, qvel, time, memory = run.states[first]
             if kept is not None:
                 memory = [memory[k] for k in kept]
@@ -116,8 +133,8 @@ def system_error(system, runs, noise, perfect=False, kept=None):
             for row in range(first, last):
                 system.advance(run.ctrl[row], run.stamps[row + 1] - run.stamps[row])
                 goal = run.true_qpos if perfect else run.qpos
-                differences.append(difference(model, goal[row + 1], system.reading()[0]) / noise)
-    return rms(differences)
+                out.append(difference(model, goal[row + 1], system.reading()[0]) / noise)
+    return np.array(out).reshape(-1, model.nv)
 
 
 def move_reading(system, qpos, qvel):

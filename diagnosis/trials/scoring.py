@@ -7,6 +7,7 @@ A finding is an entry of diagnosis.json's "findings"; an answer is `drawing.Tria
 """
 
 import math
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +16,6 @@ from scipy.optimize import linear_sum_assignment
 TOLERANCE = 0.05  # of a true value, or of its change from the nominal one
 LONGEST_CLASS = 3  # names that a finding may give besides its own
 MOST_VARIABLES = 3  # that an `unknown` may claim to depend on
-NOISE = 1.0  # an effect below this many times the noise need not be found
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,14 @@ class Score:
 def score_findings(answer, findings, seen=None):
     """Score findings against an answer; seen: per item, whether the training data can show it.
 
-    Without `seen`, an item counts as needed where it moves the training recordings by more than
-    the noise. Items that are not needed may be found all the same.
+    Without `seen` the oracle's word in the answer counts ("distinct"). Items that are not needed
+    may be found all the same; where they are not, one claim at their place is neutral, for the
+    data could not tell it from the truth.
     """
     hidden = answer["hidden"]
     if seen is None:
-        seen = [size > NOISE for size in answer["over_noise"]]
+        seen = answer["distinct"]
+    seen = [*seen, *[False] * (len(hidden) - len(seen))]
     pairing = assign(hidden, findings)
     matches, taken = [], set()
     for index, item in enumerate(hidden):
@@ -116,6 +118,10 @@ def score_findings(answer, findings, seen=None):
         matches.append(_match(index, item, finding, findings[finding]))
     rest = [k for k in range(len(findings)) if k not in taken]
     neutral = [k for k in rest if taken and findings[k]["effect"] == "time_step"]
+    for index, item in enumerate(hidden):
+        if not seen[index] and item["required"] and matches[index].finding is None:
+            here = (k for k in rest if k not in neutral and _beside(findings[k]["place"], item))
+            neutral += list(here)[:1]
     false = [k for k in rest if k not in neutral]
     needed = tuple(k for k, item in enumerate(hidden) if seen[k] and item["required"])
     return Score(tuple(matches), tuple(false), tuple(neutral), needed)
@@ -158,6 +164,13 @@ def same_place(place, other):
     kinds = {place["kind"], other["kind"]}
     alike = len(kinds) == 1 or ("+" in str(other["name"]) and kinds <= {"joint", "joints"})
     return alike and parts(place) == parts(other)
+
+
+def _beside(place, item):
+    """Is a finding's place the item's own joint, link or drive (one number), or one of them the world?"""
+    numbers = lambda p: set(re.findall(r"\d+", str(p["name"])))
+    here, there = numbers(place), numbers(item["place"])
+    return not here or not there or bool(here & there)
 
 
 def _plain(variable):

@@ -1,0 +1,188 @@
+"""Running trials and writing their table: one row per trial, whatever tool is entered.
+
+    row = run_trial(Task(number=3, key=(1, 3), settings="development"), template, limit=900)
+
+A trial is drawn, the tool gets nominal model and training recordings in a folder of its own, its
+report is scored by `scoring` and replayed on held-out recordings that it never saw.
+"""
+
+import csv
+import json
+import os
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import mujoco
+from tqdm import tqdm
+
+from diagnosis.common.atomic_files import write_table
+from diagnosis.trials.drawing import answer_text, draw_trial, write_folder
+from diagnosis.trials.prediction import model_error, system_error
+from diagnosis.trials.replay import replay, save_runs
+from diagnosis.trials.robots import DEVELOPMENT, FINAL, to_mjcf
+from diagnosis.trials.scoring import Score, score_findings
+from diagnosis.trials.tools import run_tool
+
+SETTINGS = {"development": DEVELOPMENT, "final": FINAL}
+COLUMNS = tuple(
+    "number key seals version tool settings answer exit seconds cpu_seconds verdict findings "
+    "needed found first listed class_sizes valued false neutral strict values unknown_right "
+    "error_before error_after error_floor reported_after note".split()
+)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A trial to run. key: integers it is drawn from; secret: what the seal hides, revealed in the
+    row; seals: the commit that published the seals ("" in development)."""
+
+    number: int
+    key: tuple
+    settings: str
+    secret: str = ""
+    seals: str = ""
+    version: str = ""
+
+
+def run_trial(task, template, limit=900):
+    """Draw a trial, run the tool on it, score what it wrote. Returns a row of the table."""
+    trial = draw_trial(task.key, SETTINGS[task.settings])
+    nominal = mujoco.MjModel.from_xml_string(to_mjcf(trial.nominal))
+    row = {
+        "number": task.number,
+        "key": task.secret or "-".join(map(str, task.key)),
+        "seals": task.seals,
+        "version": task.version,
+        "tool": template,
+        "settings": task.settings,
+        "answer": answer_text(trial.answer),
+        "error_before": model_error(nominal, nominal, trial.held_out, trial.noise),
+        "error_floor": system_error(trial.system(), trial.held_out, trial.noise),
+    }
+    with tempfile.TemporaryDirectory() as parent:
+        bench = Path(parent) / "bench"
+        bench.mkdir()
+        done = run_tool(template, bench, write_folder(trial, bench), limit)
+        row |= {"exit": done.exit, "seconds": done.seconds, "cpu_seconds": done.cpu_seconds}
+        row["note"] = done.note
+        if done.exit == 0 and (done.report / "corrected.xml").exists():
+            held_out = Path(parent) / "held_out.npz"
+            save_runs(held_out, trial.held_out, trial.noise)
+            row["error_after"] = replay(bench / "sim.xml", done.report, held_out)
+        summary = done.summary() if done.exit == 0 else None
+    return plain(row | judged(trial.answer, summary))
+
+
+def judged(answer, summary):
+    """The columns that say what a diagnosis.json (None: there is none) is worth against an answer."""
+    try:
+        score = score_findings(answer, summary["findings"] if summary else [])
+        findings = summary["findings"] if summary else []
+        reported = ((summary or {}).get("fit") or {}).get("held_out") or {}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        return judged(answer, None) | {
+            "note": f"diagnosis.json cannot be scored: {type(error).__name__} {error}"[:300]
+        }
+    row = score_columns(score)
+    row["strict"] = int(score.strict and summary is not None)
+    return row | {
+        "verdict": (summary or {}).get("verdict", ""),
+        "findings": json.dumps(findings) if summary else "",
+        "reported_after": reported.get("after", ""),
+    }
+
+
+def score_columns(score: Score):
+    """A Score as columns."""
+    values = [
+        {"item": m.item, **asdict(v), "near": v.near, "held": v.held}
+        for m in score.matches
+        for v in m.values
+    ]
+    return {
+        "needed": len(score.needed),
+        "found": score.found,
+        "first": score.first,
+        "listed": sum(score.matches[k].listed for k in score.needed),
+        "class_sizes": json.dumps([m.class_size for m in score.matches if m.finding is not None]),
+        "valued": score.valued,
+        "false": len(score.false),
+        "neutral": len(score.neutral),
+        "values": json.dumps(values),
+    }
+
+
+def plain(row):
+    """A row with numbers as short text."""
+    return {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
+
+
+# the table
+
+
+def read_rows(path):
+    """Rows of a table, as dicts of text; none where there is no such file."""
+    csv.field_size_limit(10**8)
+    if not Path(path).exists():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write_rows(path, rows):
+    """The whole table, by number, at once."""
+    write_table(path, COLUMNS, sorted(rows, key=lambda row: int(row["number"])))
+
+
+def cores():
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def run_tasks(tasks, template, out, jobs, limit, ray_address=None):
+    """Run the tasks that `out` has no row of yet; the table is written after each."""
+    rows = read_rows(out)
+    done = {int(row["number"]) for row in rows}
+    wanted = [task for task in tasks if task.number not in done]
+    Path(out).parent.mkdir(parents=True, exist_ok=True)
+    results = on_ray if ray_address else on_cores
+    source = results(wanted, template, limit, ray_address or jobs)
+    for row in tqdm(source, total=len(wanted), disable=not sys.stderr.isatty()):
+        if int(row["number"]) not in done:  # a task that a lost node had done is not counted twice
+            done.add(int(row["number"]))
+            rows.append(row)
+            write_rows(out, rows)
+    return rows
+
+
+def on_cores(tasks, template, limit, jobs):
+    """Rows as they come, from `jobs` processes."""
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        futures = [pool.submit(run_trial, task, template, limit) for task in tasks]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def on_ray(tasks, template, limit, address):
+    """Rows as they come, from a Ray cluster; what a lost node had begun is begun again elsewhere."""
+    import ray
+
+    root = str(Path(__file__).resolve().parents[2])
+    environment = {"env_vars": {"PYTHONPATH": root, "OMP_NUM_THREADS": "1"}}
+    ray.init(address=address, runtime_env=environment, log_to_driver=False)
+    try:
+        remote = ray.remote(num_cpus=1, max_retries=-1)(run_trial)
+        waiting = [remote.remote(task, template, limit) for task in tasks]
+        while waiting:
+            ready, waiting = ray.wait(waiting, num_returns=1)
+            yield from ray.get(ready)
+    finally:
+        ray.shutdown()

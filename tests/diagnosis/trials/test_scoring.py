@@ -1,0 +1,174 @@
+"""Every rule of the benchmark, each on a case made for it."""
+
+import pytest
+
+from diagnosis.trials.scoring import assign, score_findings
+
+
+def hidden(
+    effect="coulomb_friction", name="joint0", kind="joint", required=True, needs=(), **values
+):
+    return {
+        "effect": effect,
+        "place": {"kind": kind, "name": name},
+        "parameters": values or {"frictionloss": 1.0},
+        "needs": list(needs),
+        "required": required,
+    }
+
+
+def finding(
+    effect="coulomb_friction", name="joint0", kind="joint", others=(), depends=(), **values
+):
+    values = values or {"frictionloss": (1.0, 0.9, 1.1)}
+    named = lambda k, v: {"name": k, "nominal": 0.0, "value": v[0], "low": v[1], "high": v[2]}
+    return {
+        "effect": effect,
+        "place": {"kind": kind, "name": name},
+        "parameters": [named(k, v) for k, v in values.items()],
+        "depends_on": list(depends),
+        "also_possible": list(others),
+    }
+
+
+def score(items, findings, distinct=None):
+    distinct = distinct or [item["required"] for item in items]
+    return score_findings({"hidden": items, "distinct": distinct}, findings)
+
+
+def test_right_name_and_value_is_a_strict_success():
+    got = score([hidden()], [finding()])
+    assert got.strict and got.first == got.found == got.valued == 1 and not got.false
+    assert got.matches[0].values[0].held
+
+
+def test_nothing_hidden_and_nothing_said_is_a_strict_success():
+    assert score([], []).strict
+
+
+@pytest.mark.parametrize("said", [{"effect": "viscous_damping"}, {"name": "joint1"}])
+def test_wrong_effect_or_place_is_a_miss_and_a_false_claim(said):
+    got = score([hidden()], [finding(**said)])
+    assert not got.strict and got.found == 0 and got.false == (0,)
+
+
+def test_any_claim_about_a_null_is_false():
+    got = score([], [finding(), finding("time_step", "world", "world")])
+    assert got.false == (0, 1) and not got.strict
+
+
+def test_time_step_beside_a_right_finding_is_neutral():
+    got = score([hidden()], [finding("time_step", "world", "world"), finding()])
+    assert got.strict and got.neutral == (0,)
+
+
+def test_time_step_beside_a_wrong_finding_is_false():
+    got = score([hidden()], [finding("time_step", "world", "world"), finding(name="joint3")])
+    assert got.false == (0, 1)
+
+
+def test_a_declared_class_counts_but_not_as_first_name():
+    said = finding("viscous_damping", damping=(2.0, 1.0, 3.0), others=[finding()])
+    got = score([hidden()], [said])
+    assert got.strict and got.found == 1 and got.first == 0
+    assert got.matches[0].listed and got.matches[0].class_size == 1
+    assert got.matches[0].values[0].value == 1.0  # the listed effect's own
+
+
+def test_a_class_longer_than_three_is_cut():
+    others = [finding("mass", "link0", "body"), finding("gain"), finding("bias"), finding()]
+    assert score([hidden()], [finding("viscous_damping", others=others)]).found == 0
+
+
+def test_one_finding_matches_one_truth():
+    pair = [hidden(), hidden("viscous_damping", damping=2.0)]
+    both = finding(others=[finding("viscous_damping", damping=(2.0, 1.9, 2.1))])
+    got = score(pair, [both])
+    assert got.found == 1 and got.first == 1 and not got.strict
+
+
+def test_matching_finds_all_that_can_be_matched():
+    pair = [hidden(), hidden("viscous_damping", damping=2.0)]
+    both = finding(others=[finding("viscous_damping", damping=(2.0, 1.9, 2.1))])
+    first_only = finding()
+    assert assign(pair, [both, first_only]) == {1: 0, 0: 1}
+
+
+def test_the_same_thing_said_twice_is_false_once():
+    got = score([hidden()], [finding(), finding()])
+    assert got.found == 1 and len(got.false) == 1
+
+
+@pytest.mark.parametrize("value, near", [(1.049, True), (1.051, False), (0.949, False)])
+def test_values_within_five_percent(value, near):
+    got = score([hidden()], [finding(frictionloss=(value, 0.5, 1.5))])
+    assert got.found == 1 and (got.valued == 1) is near and got.strict is near
+
+
+def test_a_value_of_null_is_not_right():
+    assert score([hidden()], [finding(frictionloss=(None, None, None))]).valued == 0
+
+
+def test_interval_that_misses_the_truth():
+    value = score([hidden()], [finding(frictionloss=(1.02, 1.01, 1.03))]).matches[0].values[0]
+    assert value.near and value.held is False
+
+
+def test_interval_not_given():
+    value = score([hidden()], [finding(frictionloss=(1.02, None, None))]).matches[0].values[0]
+    assert value.held is None
+
+
+def test_vectors_are_judged_by_their_length():
+    item = hidden("gravity", "world", "world", x=0.0, y=0.5, z=-9.8)
+    near = finding("gravity", "world", "world", x=(0.3, 0, 1), y=(0.3, 0, 1), z=(-9.8, -10, -9))
+    far = finding("gravity", "world", "world", x=(0.8, 0, 1), y=(0.5, 0, 1), z=(-9.8, -10, -9))
+    assert score([item], [near]).valued == 1
+    assert score([item], [far]).valued == 0
+
+
+def test_a_single_number_is_compared_whatever_its_name():
+    item = hidden("delay", "drive0", "actuator", seconds=0.02)
+    said = finding("delay", "drive0", "actuator", delay=(0.0201, 0.019, 0.021))
+    assert score([item], [said]).valued == 1
+
+
+def test_unknown_needs_place_and_variable():
+    item = hidden("unknown", needs=["velocity:joint0"], amplitude=1.0)
+    right = finding("unknown", depends=["velocity:joint0"])
+    assert score([item], [right]).strict
+    assert score([item], [finding("unknown", depends=["position:joint0"])]).found == 0
+    assert score([item], [finding("unknown", "joint1", depends=["velocity:joint0"])]).found == 0
+
+
+def test_unknown_that_depends_on_everything_says_nothing():
+    item = hidden("unknown", needs=["velocity:joint0"], amplitude=1.0)
+    everything = ["velocity:joint0", "position:joint0", "control:drive0", "time"]
+    assert score([item], [finding("unknown", depends=everything)]).found == 0
+
+
+def test_what_the_data_cannot_show_is_not_asked_for():
+    got = score([hidden()], [], distinct=[False])
+    assert got.needed == () and got.strict
+
+
+def test_one_claim_in_place_of_what_cannot_be_told_apart_is_neutral():
+    claims = [finding("viscous_damping"), finding("gain", "drive0", "actuator")]
+    got = score([hidden()], claims, distinct=[False])
+    assert got.neutral == (0,) and got.false == (1,)
+    elsewhere = score([hidden()], [finding("viscous_damping", "joint4")], distinct=[False])
+    assert elsewhere.false == (0,)
+
+
+def test_a_wrong_nominal_value_may_be_put_right_and_need_not_be():
+    items = [hidden(), hidden("mass", "link0", "body", required=False, mass=2.0)]
+    mass = finding("mass", "link0", "body", mass=(2.3, 2.2, 2.4))
+    assert score(items, [finding()]).strict
+    got = score(items, [finding(), mass])
+    assert got.strict and not got.false
+
+
+def test_coupled_joints_in_either_order():
+    item = hidden("coupled_friction", "joint0+joint1", level=1.0)
+    said = finding("coupled_friction", "joint1+joint0", level=(1.0, 0.9, 1.1))
+    assert score([item], [said]).strict
