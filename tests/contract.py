@@ -1,6 +1,14 @@
-"""What the contract says of diagnosis.json."""
+"""What the contract says of diagnosis.json: the schema that ships, and what a schema cannot say."""
 
+import json
 import re
+from pathlib import Path
+
+import jsonschema
+
+from diagnosis import report
+
+SCHEMA_FILE = Path(report.__file__).with_name("diagnosis.schema.json")
 
 NUMBER, TEXT = (int, float), str
 PLACE = {"kind": TEXT, "name": TEXT}
@@ -44,23 +52,35 @@ def conforms(value, schema, where="$"):
         )
 
 
+def validator():
+    """A validator by the schema file of format 2."""
+    schema = json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))
+    return jsonschema.Draft202012Validator(schema)
+
+
 def contract(summary):
-    """Asserts everything the contract says of diagnosis.json that a shape cannot."""
-    conforms(summary, SCHEMA)
-    assert summary["format"] == 1 and summary["verdict"] in ("match", "mismatch")
-    assert (summary["verdict"] == "mismatch") == bool(summary["findings"])
+    """Asserts everything the contract says of diagnosis.json. The shape is the schema file's; format
+    1, from before that file, has one of its own here."""
+    if summary["format"] == 1:
+        conforms(summary, SCHEMA)
+        assert summary["verdict"] in ("match", "mismatch")
+        assert (summary["verdict"] == "mismatch") == bool(summary["findings"])
+    else:
+        validator().validate(summary)
+        assert summary["verdict"] != "match" or not summary["findings"]
+        assert summary["verdict"] != "mismatch" or summary["findings"]
     assert all(isinstance(v, NUMBER) and v > 0 for v in summary["noise"].values())
     for found in summary["findings"]:
         assert found["place"]["kind"] in ("joint", "actuator", "body", "geom", "sensor", "world")
         assert found["place"]["kind"] != "world" or found["place"]["name"] == "world"
-        assert (
-            found["written_as"] in ("mjcf", "measurement", "none")
-            and len(found["also_possible"]) <= 3
-        )
+        assert found["written_as"] in ("mjcf", "python", "measurement", "none")
+        assert len(found["also_possible"]) <= 3
         for p in found["parameters"]:
-            assert p["low"] <= p["value"] <= p["high"]
+            assert None in (p["low"], p["value"], p["high"]) or p["low"] <= p["value"] <= p["high"]
         for name in found["depends_on"]:
-            assert name == "time" or re.fullmatch(r"(position|velocity|control|contact):.+", name)
+            assert name == "time" or re.fullmatch(
+                r"(position|velocity|control|contact|load):.+", name
+            )
         when = found["when"]
         assert (
             when is None
