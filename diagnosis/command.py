@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from diagnosis.common.mujoco_warnings import quiet
 from diagnosis.estimator import identify
+from diagnosis.recordings import plausibility
 from diagnosis.recordings import recording as recorded
 from diagnosis.recordings.cleaning import without_defects
 from diagnosis.report import text as wording
@@ -50,11 +51,11 @@ def diagnose(model, recordings, held_out=None, progress=None):
     train, held = _recordings(recordings, held_out, world.model)
     given, notes = without_defects(train + held, world.model)
     train, held = given[: len(train)], given[len(train) :]
-    notes += recorded.check(given, world.model)
+    notes += plausibility.check(given, world.model)
     notes += _runs(world.model, given)
     if not held:
         train, held = split(train)
-    recorded.enough(train)
+    plausibility.enough(train)
     diagnosis = identify(world, train, held, progress=progress)
     return dataclasses.replace(
         diagnosis, summary={**diagnosis.summary, "warnings": notes + diagnosis.summary["warnings"]}
@@ -76,7 +77,7 @@ def split(recordings):
         if min(cut, len(recording.time) - cut) < 10:
             raise recorded.RecordingError(
                 f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} rows; record again, longer "
-                f"({recorded.ENOUGH}), or give --held-out"
+                f"({plausibility.ENOUGH}), or give --held-out"
             )
         early = dataclasses.replace(
             recording,

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from diagnosis.recordings.formats import WIDTHS
-from diagnosis.recordings.recording import grouped
+from diagnosis.recordings.columns import WIDTHS
+from diagnosis.recordings.plausibility import grouped
 
 AWAY, PACE = (
     8,

@@ -12,7 +12,7 @@ import numpy as np
 
 from diagnosis.effects.base import HINGE, SLIDE
 from diagnosis.recordings import inverse_dynamics
-from diagnosis.recordings.formats import columns_of
+from diagnosis.recordings.columns import columns_of
 
 CENTRES = 400  # rows at which the law is tested
 HALVES = (

@@ -14,8 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from malformed import ARM, HEADER, archive, arm, run, text, whole
 
-from diagnosis.recordings.formats import columns_of
-from diagnosis.recordings.recording import Recording, RecordingError, check, load
+from diagnosis.recordings.columns import columns_of
+from diagnosis.recordings.plausibility import check
+from diagnosis.recordings.recording import Recording, RecordingError, load
 
 REAL = str(Path(__file__).resolve().parents[4] / "shared" / "recordings")
 FREE = """
