@@ -91,6 +91,69 @@ def set_lag(actuator, seconds, model):
         actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTER, False
 
 
+class ServoGain(ActuatorEffect):
+    """A gain of a position servo, force = kp (u − q) − kv q̇, apart from the other one.
+
+    Both in the same ratio are `gain`. Ahead of it in the catalogue, so that it scales what these set.
+    """
+
+    acts_through = "control"
+
+    def fits(self, model, i):
+        kp = -model.actuator_biasprm[i, 1]
+        plain = model.actuator_gaintype[i] == int(mujoco.mjtGain.mjGAIN_FIXED)
+        return bool(super().fits(model, i) and plain and kp > 0 and model.actuator_gainprm[i, 0])
+
+
+@catalogue
+class ServoStiffness(ServoGain):
+    """kp in force = kp (u − q) − kv q̇, in N·m/rad or N/m of the actuator's length; kv stays. Source: MuJoCo's <position>."""
+
+    name, related = "servo_stiffness", ("gain", "servo_damping", "stiffness")
+
+    def parameters(self, model, i):
+        kp, unit = (
+            -model.actuator_biasprm[i, 1],
+            {"N·m": "N·m/rad", "N": "N/m"}[self.unit(model, i)],
+        )
+        return (Parameter("kp", unit, kp, 0.01 * kp, 100 * kp, 0.01 * kp),)
+
+    @staticmethod
+    def _scale(actuator_gainprm, actuator_biasprm, kp):
+        actuator_gainprm[0] *= kp / -actuator_biasprm[1]
+        actuator_biasprm[1] = -kp
+
+    def edit(self, model, i, values):
+        self._scale(model.actuator_gainprm[i], model.actuator_biasprm[i], values[0])
+
+    def write(self, spec, model, i, values):
+        actuator = self.general(spec, model, i)
+        self._scale(actuator.gainprm, actuator.biasprm, values[0])
+        return "mjcf"
+
+
+@catalogue
+class ServoDamping(ServoGain):
+    """kv in force = kp (u − q) − kv q̇, in N·m·s/rad or N·s/m; kp stays. Source: MuJoCo's <position>.
+
+    The same force as `back_emf`, and as `viscous_damping` of the one joint it drives (but for a limited force): a class.
+    """
+
+    name, related = "servo_damping", ("gain", "servo_stiffness", "viscous_damping", "back_emf")
+    acts_through = "velocity"
+
+    def parameters(self, model, i):
+        (damping,) = BackEmf().parameters(model, i)
+        return (replace(damping, name="kv"),)
+
+    def edit(self, model, i, values):
+        model.actuator_biasprm[i, 2] = -values[0]
+
+    def write(self, spec, model, i, values):
+        self.general(spec, model, i).biasprm[2] = -values[0]
+        return "mjcf"
+
+
 @catalogue
 class Gain(ActuatorEffect):
     """The actuator is stronger or weaker by a ratio, feedback of a servo included."""
@@ -302,6 +365,9 @@ class DeadZone(ActuatorEffect):
         return replace(
             signal, value=np.sign(signal.value) * np.maximum(abs(signal.value) - values[0], 0.0)
         )
+
+    def stepwise(self, model, i):
+        return bool(self._servo(model, i))
 
     def force(self, models, i, values):
         model = models[0]

@@ -6,8 +6,9 @@ unless a class overrides it:
     edit      fields of the compiled model         build    parts edit() sizes
     command   the control on its way               push     a constant force
     force     a force that depends on the state    measure  the sensor
-    write     the same in MJCF                     probes   values worth a try
-    suited    steps for the motion recorded        far      values to try at full size
+    limit     dry friction that depends on it      probes   values worth a try
+    write     the same in MJCF                     far      values to try at full size
+    suited    steps for the motion recorded
 
 Values are absolute, in SI units, with the sign of the MJCF field. A new effect
 is one class with the decorator @catalogue, and no other line.
@@ -185,12 +186,38 @@ class Effect:
         """
         return None
 
+    def limit(self, models, i, values):
+        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,), qfrc_bias (S,nv)) -> (S,nv), at least 0.
+
+        By so much the dry friction that a joint can hold, its frictionloss, is larger. The arguments are those of force();
+        qfrc_bias is MuJoCo's: Coriolis forces minus gravity, so that -qfrc_bias is the load from outside, but for contacts.
+        """
+        return None
+
+    def rubs(self, models, i, values):
+        """As force(), the friction that limit() allows on moving joints: −limit · sign(v). For linear chains, which cannot stick."""
+        limit = self.limit(models, i, values)
+        if limit is None:
+            return None
+
+        def opposing(qpos, qvel, ctrl, time, qfrc_bias):
+            return -limit(qpos, qvel, ctrl, time, qfrc_bias) * np.sign(qvel)
+
+        return opposing
+
+    def stepwise(self, model, i):
+        """Whether it has to be worked out before each step of a simulation."""
+        return self.overrides("force") or self.overrides("limit")
+
     def measure(self, values):
         """(offset, ratio, delay) of the sensor."""
         return 0.0, 1.0, 0.0
 
     def write(self, spec, model, i, values):
-        """Put the effect into spec, of the nominal model; return 'mjcf', 'measurement' or 'none'."""
+        """Put the effect into spec, of the nominal model; return 'mjcf', 'python', 'measurement' or 'none'.
+
+        'python': spec holds it only in part or not at all, corrected.py does (see part()).
+        """
         raise NotImplementedError
 
     def overrides(self, method):
@@ -205,6 +232,20 @@ def catalogue(cls):
         instance.kind = kind
         EFFECTS.append(instance)
     return cls
+
+
+def joints_of(model, name):
+    """Ids of the joint of that name, or of the two that "a+b" names."""
+    find = lambda one: mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, one)
+    if find(name) >= 0:
+        return (find(name),)
+    parts = name.split("+")
+    pairs = (("+".join(parts[:k]), "+".join(parts[k:])) for k in range(1, len(parts)))
+    for pair in pairs:
+        ids = tuple(map(find, pair))
+        if min(ids) >= 0:
+            return ids
+    raise KeyError(f"no joint {name}")
 
 
 def turns(model, j):

@@ -11,10 +11,12 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
+from diagnosis.simulation.dry_friction import VariableFriction
 from diagnosis.simulation.editable_model import BALL, FREE, Working
 from diagnosis.simulation.readout import locate, read
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 RUN_UP = (
     0.4,
     0.1,
@@ -31,6 +33,10 @@ class Engine:
         self.rest = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.working.data, self.rest, STATE)
         self.batch = None
+        self.clones = (
+            {},
+            {},
+        )  # with and without what is conditional: of models whose friction varies with the state
 
     def run(self, cases, start_qpos, start_qvel, windows, rows, step, count, sensors):
         """World.simulate for n simulations that share structure, time step and way of stepping.
@@ -198,7 +204,18 @@ class Engine:
             [np.array([getattr(d, f) for d in drives]) for drives in (on, off)]
             for f in ("ctrl", "qfrc", "xfrc")
         )
-        forces = [self._forces(drives) for drives in (on, off)]
+        conditional = any(c.when for c in cases)
+        forces = [
+            self._functions(on, "force"),
+            self._functions(off, "force") if conditional else [],
+        ]
+        friction = [
+            VariableFriction(drives, self._functions(drives, "limit"), self.model, pool)
+            for drives, pool in zip((on, off)[: 1 + conditional], self.clones)
+        ]
+        rubbing = any(f.varying for f in friction)
+        if rubbing:
+            live["qfrc_bias"] = batch.bind("qfrc_bias")
         always, never = (-np.inf, np.inf), (np.inf, np.inf)
         low, high = np.array(
             [
@@ -212,10 +229,9 @@ class Engine:
             now = (low <= time) & (time < high)
             if active is None or (now != active).any():
                 active = now
-                batch.set_models(
-                    [(a if yes else b).model or self.model for a, b, yes in zip(on, off, active)]
-                    + spare
-                )
+                sides = zip(friction[0].models, friction[-1].models, active)
+                models = [a if yes else b for a, b, yes in sides]
+                batch.set_models(models + spare)
             j, yes = min(k, ctrl[0].shape[1] - 1), active[:, None]
             live["ctrl"][:n] = np.where(yes, ctrl[0][:, j], ctrl[1][:, j])
             push = np.where(yes, *qfrc)
@@ -228,6 +244,12 @@ class Engine:
                         time[members],
                     )
                     push[members] += np.where(chosen[members, None], added, 0.0)
+            if rubbing:
+                batch.forward(ids, VELOCITY_STAGE)
+                state = [live[f][:n] for f in ("qpos", "qvel", "ctrl")]
+                for levels in friction:
+                    levels.set(*state, time, live["qfrc_bias"][:n])
+                batch.set_models(models + spare)
             live["qfrc_applied"][:n] = push
             live["xfrc_applied"][:n] = np.where(yes[..., None], *xfrc)
             try:
@@ -238,18 +260,18 @@ class Engine:
                 out[f][:, k] = live[f][:n]
         return failed
 
-    def _forces(self, drives):
-        """[(members, function)] of the state-dependent forces of simulations."""
+    def _functions(self, drives, method):
+        """[(members, function)] of the state-dependent "force" or friction "limit" of simulations."""
         groups = {}
         for s, drive in enumerate(drives):
             for candidate, values in drive.items:
-                if candidate.effect.overrides("force") and drive.model is not None:
+                if candidate.effect.overrides(method) and drive.model is not None:
                     groups.setdefault(candidate, []).append((s, values))
         forces = []
         for candidate, members in groups.items():
             ids, values = map(np.array, zip(*members))
             i = candidate.effect.id(self.model, candidate.place.name)
-            function = candidate.effect.force([drives[s].model for s in ids], i, values)
+            function = getattr(candidate.effect, method)([drives[s].model for s in ids], i, values)
             if function is not None:
                 forces.append((ids, function))
         return forces

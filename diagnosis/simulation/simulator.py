@@ -16,7 +16,7 @@ import numpy as np
 
 from diagnosis.common.mujoco_warnings import quiet
 from diagnosis.effects import EFFECTS, unmodelled
-from diagnosis.effects.base import HINGE, SLIDE, Candidate, Place
+from diagnosis.effects.base import HINGE, SLIDE, Candidate, Place, joints_of
 from diagnosis.simulation.batch import Engine
 from diagnosis.simulation.control_signal import SLACK
 
@@ -168,8 +168,8 @@ class World:
     def joints(self, place):
         """Ids of the joints a place belongs to, or None for all."""
         m = self.model
-        if place.kind == "joint":
-            return {m.joint(place.name).id}
+        if place.kind == "joint":  # or two of them, "a+b"
+            return set(joints_of(m, place.name))
         if place.kind == "body":
             return {j for j in range(m.njnt) if m.jnt_bodyid[j] == m.body(place.name).id}
         if place.kind == "actuator" and m.actuator_trntype[m.actuator(place.name).id] == int(
@@ -303,7 +303,10 @@ class Case:
         steps = [v[0] for c, v in self.on if c.effect.name == "time_step"]
         self.step = (steps[0] if steps else model.opt.timestep) / refine
         self.structure = frozenset(c for c, _ in self.on if c.effect.overrides("build"))
-        self.stepwise = bool(self.when) or any(c.effect.overrides("force") for c, _ in self.on)
+        place = lambda c: c.effect.id(model, c.place.name)
+        self.stepwise = bool(self.when) or any(
+            c.effect.stepwise(model, place(c)) for c, _ in self.on
+        )
         self.late = any(
             c.effect.measure(v)[2] for c, v in self.on
         )  # which takes a start of its own

@@ -25,6 +25,8 @@ def case(request):
 
 def test_the_contracts_effects_are_all_there():
     assert {effect.name for effect in EFFECTS} == set(SIZES)
+    here = {c.effect.name for kind in MODELS for c in arm(kind)[0].candidates}
+    assert here == set(SIZES)
 
 
 def test_nothing_is_exactly_nominal(case):
@@ -83,7 +85,7 @@ def test_every_effect_is_the_same_in_mjcf(case):
         "contact_damping",
         "ground_height",
     }  # the servos hold the arm off the floor
-    assert felt | contact == set(SIZES)
+    assert felt | contact == {c.effect.name for c in world.candidates} | contact
 
 
 def test_all_effects_together_are_the_same_in_mjcf(case):
@@ -101,6 +103,8 @@ def test_all_effects_together_are_the_same_in_mjcf(case):
         "delay",
         "lag",
         "joint_stop",
+        "load_friction",
+        "friction_map",
     }
     setting = {
         c: SIZES[c.effect.name]

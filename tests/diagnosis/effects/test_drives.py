@@ -1,0 +1,155 @@
+"""Physics of drives against a pendulum integrated here, by its own equations, at a hundredth of the step."""
+
+import mujoco
+import numpy as np
+import pytest
+from plants import SIZES, arm, commanded, pendulum
+
+from diagnosis.effects.drives import FrictionCurve, friction_curve
+from diagnosis.simulation.simulator import Window, World
+
+ROWS, DT = 100, 0.01
+INERTIA, WEIGHT = (
+    0.025,
+    0.5 * 9.81 * 0.1,
+)  # of plants.PENDULUM about its hinge; torque on it lying flat
+SERVO = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody><body><joint name="j" axis="0 1 0"/>
+<inertial pos="0 0 -.1" mass=".5" diaginertia=".02 .02 .02"/></body></worldbody>
+<actuator><position name="m" joint="j" kp="3" kv="0.05" forcerange="-1 1"/></actuator></mujoco>"""
+
+
+def waves(amplitude=0.5):
+    time = np.arange(ROWS) * DT
+    return commanded(time, amplitude * (np.sin(6 * time) + 0.6 * np.sin(14 * time + 1))[:, None])
+
+
+def by_hand(control, torque, level, q=0.0, v=1.0, h=1e-5):
+    """Positions (ROWS,) of the pendulum: torque(q, v, u, t) in it, dry friction up to level(q, v, drive, load).
+
+    Moreau's time stepping: friction stops the motion, or opposes it with all it has.
+    """
+    out, steps = [q], round(DT / h)
+    for row in range(ROWS - 1):
+        for k in range(steps):
+            drive, load = torque(q, v, control[row], row * DT + k * h), -WEIGHT * np.sin(q)
+            free = v + h / INERTIA * (drive + load)
+            v = np.sign(free) * max(abs(free) - h / INERTIA * level(q, v, drive, load), 0.0)
+            q += h * v
+        out.append(q)
+    return np.array(out)
+
+
+def run(world, setting, recording, q=0.0, v=1.0):
+    windows = [Window(recording, 0, ROWS - 1)]
+    return world.simulate([setting], [[q]], [[v]], windows)[0][0, :, 0]
+
+
+def hold(q, v, u, t):
+    return u
+
+
+def servo(q, v, u, t):
+    return np.clip(3 * (u - q) - 0.05 * v, -1, 1)
+
+
+SHARES = 0.4, 0.2, 0.7
+
+
+def loaded(q, v, drive, load):
+    driving, driven, external = SHARES
+    return (driving if drive * v >= 0 else driven) * abs(drive - external * load)
+
+
+def mapped(q, v, drive, load):
+    return 0.1 * (1 + 0.8 * np.sin(5 * q + 0.4))
+
+
+KNOTS, LEVELS = (-0.4, 0.0, 0.3), (0.2, 0.0, 0.15)
+
+
+def bent(q, v, drive, load):
+    return np.interp(q, KNOTS, LEVELS)
+
+
+@pytest.mark.parametrize(
+    "xml, torque, level, effect, values",
+    [
+        (None, hold, loaded, "load_friction", SHARES),
+        (SERVO, servo, loaded, "load_friction", SHARES),
+        (None, hold, mapped, "friction_map", (0.1, 0.8, 5.0, 0.4)),
+        (None, hold, bent, FrictionCurve(KNOTS), LEVELS),
+    ],
+)
+def test_friction_that_depends_on_the_state(xml, torque, level, effect, values):
+    world = World(mujoco.MjSpec.from_string(xml)) if xml else pendulum()
+    named = isinstance(effect, str)
+    candidate = world.candidate(effect, "j") if named else friction_curve(world.model, "j", KNOTS)
+    recording = waves()
+    expected = by_hand(recording.ctrl[:, 0], torque, level)
+    assert abs(run(world, {candidate: values}, recording) - expected).max() < 4e-3
+    assert abs(run(world, {}, recording) - expected).max() > 0.1
+
+
+def test_friction_of_the_load_holds_and_slips():
+    """Below its limit a loaded joint stands; beyond it, it moves: at 0.3 of drive and load together."""
+    world, flat = pendulum(), np.pi / 2
+    candidate = world.candidate("load_friction", "j")
+    for torque, moves in ((0.9 * WEIGHT, False), (0.2 * WEIGHT, True), (2.5 * WEIGHT, True)):
+        # |τ − W| against 0.3 (τ + W): 0.1 < 0.57, 0.8 > 0.36, 1.5 > 1.05 (times W)
+        recording = commanded(np.arange(ROWS) * DT, np.full((ROWS, 1), torque))
+        travelled = np.ptp(run(world, {candidate: (0.3, 0.3, 1.0)}, recording, flat, 0.0)[:20])
+        assert (travelled > 1e-2) == moves
+        assert moves or travelled < 2e-4
+
+
+def test_friction_of_several_joints_and_conditions_at_once():
+    """Each simulation of a batch has its own levels, also where one acts only for some of the time."""
+    world, recording = pendulum(), waves()
+    loaded_, mapped_ = (world.candidate(n, "j") for n in ("load_friction", "friction_map"))
+    when = {"recording": recording.name, "time": [0.3, 0.6]}
+    later = world.localised(mapped_, when)
+    settings = [{loaded_: SHARES}, {mapped_: SIZES["friction_map"]}, {}]
+    settings += [{later: SIZES["friction_map"], loaded_: SHARES}, {loaded_: SHARES}]
+    windows = [Window(recording, 0, ROWS - 1)] * len(settings)
+    start = np.zeros((len(settings), 1)), np.ones((len(settings), 1))
+    together = world.simulate(settings, *start, windows)[0]
+    for setting, qpos in zip(settings, together):
+        np.testing.assert_array_equal(run(world, setting, recording), qpos[:, 0])
+    np.testing.assert_array_equal(together[3, :31], together[0, :31])
+    assert abs(together[3] - together[0]).max() > 1e-2
+
+
+def test_friction_of_moving_joints_is_a_force_for_linear_chains():
+    world, _ = arm("motors")
+    candidate, rng = world.candidate("load_friction", "elbow"), np.random.default_rng(0)
+    qpos, qvel, bias = (rng.normal(size=(5, 3)) for _ in range(3))
+    ctrl, i = rng.uniform(-3, 3, (5, 3)), candidate.effect.id(world.model, "elbow")
+    values = np.tile(SHARES, (5, 1))
+    force = candidate.effect.rubs([world.model] * 5, i, values)(qpos, qvel, ctrl, np.zeros(5), bias)
+    drive = 0.5 * np.clip(ctrl[:, 2], -4, 4)  # gear times force
+    expected = np.where(drive * qvel[:, 2] >= 0, 0.4, 0.2) * abs(drive + 0.7 * bias[:, 2])
+    np.testing.assert_allclose(force[:, 2], -expected * np.sign(qvel[:, 2]))
+    assert not force[:, :2].any()
+
+
+def test_stiffness_and_damping_of_a_servo():
+    """kp and kv apart, against the same law by hand; together in one ratio they are a gain."""
+    world, recording = World(mujoco.MjSpec.from_string(SERVO)), waves()
+    stiff, slow, gain = (
+        world.candidate(n, "m") for n in ("servo_stiffness", "servo_damping", "gain")
+    )
+    assert (stiff.nominal, slow.nominal) == ((3.0,), (0.05,))
+    law = lambda q, v, u, t: np.clip(4 * (u - q) - 0.15 * v, -1, 1)
+    expected = by_hand(recording.ctrl[:, 0], law, lambda *_: 0.0)
+    qpos = run(world, {stiff: (4.0,), slow: (0.15,)}, recording)
+    assert abs(qpos - expected).max() < 5e-3  # Euler at 1 ms
+    assert abs(run(world, {}, recording) - expected).max() > 0.05
+    both = run(world, {stiff: (3.6,), slow: (0.06,)}, recording)
+    np.testing.assert_allclose(run(world, {gain: (1.2,)}, recording), both, rtol=0, atol=1e-12)
+
+
+def test_only_a_position_servo_has_gains_of_its_own():
+    kinds = {"motors": 0, "servos": 2}
+    for kind, count in kinds.items():
+        names = [c.effect.name for c in arm(kind)[0].candidates]
+        assert names.count("servo_stiffness") == names.count("servo_damping") == count
