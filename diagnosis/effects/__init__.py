@@ -8,8 +8,8 @@ A new effect is one class in one of these modules; the decorator `catalogue` add
 # Effects join the catalogue in the order of these imports.
 # isort: off
 from diagnosis.effects.base import EFFECTS
-from diagnosis.effects import joints, actuators, drives, environment, bodies
+from diagnosis.effects import joints, actuators, drives, transmissions, environment, bodies
 
 # isort: on
 
-__all__ = ["EFFECTS", "actuators", "bodies", "drives", "environment", "joints"]
+__all__ = ["EFFECTS", "actuators", "bodies", "drives", "environment", "joints", "transmissions"]

@@ -32,6 +32,11 @@ class Engine:
         self.model, self.q, self.v = self.working.model, self.working.q, self.working.v
         self.rest = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.working.data, self.rest, STATE)
+        m = self.model  # activations that the nominal model lacks, of bristles
+        owner = np.repeat(
+            np.arange(m.nactuator), np.where(m.actuator_actadr < 0, 0, m.actuator_actnum)
+        )
+        self.hidden = owner >= nominal.nactuator
         self.batch = None
         self.clones = (
             {},
@@ -58,13 +63,14 @@ class Engine:
             np.tile(self.model.qpos0, (len(cases), 1)),
             np.zeros((len(cases), self.model.nv)),
         )
-        if self.model.nq > self.nominal.nq:
-            qpos, qvel = self._run_up(cases, windows, begin, measures, step)
+        act = None
+        if self.model.nq > self.nominal.nq or self.hidden.any():
+            qpos, qvel, act = self._run_up(cases, windows, begin, measures, step)
         qpos[:, self.q], qvel[:, self.v] = q, v
         if early.any():
             lead = int(np.ceil(early.max() / step)) + 1
             for _ in range(SHOTS):
-                trial = self._trajectory(cases, recordings, begin, qpos, qvel, step, lead)
+                trial = self._trajectory(cases, recordings, begin, qpos, qvel, step, lead, act=act)
                 shown = read(
                     self.nominal,
                     trial[0][..., self.q],
@@ -77,7 +83,9 @@ class Engine:
                 qvel[:, self.v] += v - shown[1][:, 0]
             count += lead
 
-        q, v, data = self._trajectory(cases, recordings, begin, qpos, qvel, step, count, sensors)
+        q, v, data, _ = self._trajectory(
+            cases, recordings, begin, qpos, qvel, step, count, sensors, act
+        )
         time = np.full((len(cases), rows), np.nan)
         for s, w in enumerate(windows):
             time[s, : w.last - w.first + 1] = w.recording.time[w.first : w.last + 1] - begin[s]
@@ -109,13 +117,14 @@ class Engine:
         return qpos, qvel
 
     def _run_up(self, cases, windows, begin, measures, step):
-        """States (n, ·) of the working model at `begin`, for what the recording does not show of them.
+        """States (n, ·) of the working model at `begin`, activations included, for what the recording does not show of them.
 
         From RUN_UP seconds before, always again from what was recorded, with the hidden
         coordinates running on; at rest in the middle where nothing was recorded.
         """
         n = len(cases)
         qpos, qvel = np.tile(self.model.qpos0, (n, 1)), np.zeros((n, self.model.nv))
+        act = np.zeros((n, self.model.na))
         recordings = [w.recording for w in windows]
         marks = [begin - back for back in np.arange(RUN_UP[0], 0.0, -RUN_UP[1])] + [begin]
         marks = [np.maximum(t, [r.time[0] for r in recordings]) for t in marks]
@@ -126,17 +135,22 @@ class Engine:
             qpos[np.ix_(known, self.q)], qvel[np.ix_(known, self.v)] = q[known], v[known]
             steps = np.rint((then - now) / step).astype(int)
             if steps.any():
-                trajectory = self._trajectory(cases, recordings, now, qpos, qvel, step, steps.max())
-                for state, run in zip((qpos, qvel), trajectory):
+                q, v, _, a = self._trajectory(
+                    cases, recordings, now, qpos, qvel, step, steps.max(), act=act
+                )
+                for state, run in zip((qpos, qvel, act), (q, v, a)):
                     run = run[np.arange(n), steps]
                     state[:] = np.where(np.isfinite(run).all(axis=1, keepdims=True), run, state)
-        return qpos, qvel
+        return qpos, qvel, act
 
-    def _trajectory(self, cases, recordings, begin, qpos, qvel, step, count, sensors=False):
+    def _trajectory(
+        self, cases, recordings, begin, qpos, qvel, step, count, sensors=False, act=None
+    ):
         """Every step from states qpos (n, nq), qvel (n, nv) of the working model at times `begin` (n,).
 
-        Returns q (n, 1 + count, nq), v (n, 1 + count, nv), sensordata (n, 1 + count, ·) or None; NaN after
-        the first state of a simulation that failed.
+        act (n, na): activations, of which those count that the nominal model lacks; zero if not given.
+        Returns q (n, 1 + count, nq), v (n, 1 + count, nv), sensordata (n, 1 + count, ·) or None, act
+        (n, 1 + count, na); NaN after the first state of a simulation that failed.
         """
         n, memo, drive = len(cases), {}, self.working.drive
         on = [drive(c.on, r, t, step, count, memo) for c, r, t in zip(cases, recordings, begin)]
@@ -151,11 +165,11 @@ class Engine:
         batch.state[:n] = self.rest
         batch.bind("qpos")[:n], batch.bind("qvel")[:n] = qpos, qvel
         if self.model.na:
-            batch.bind("act")[:n] = [
-                self.working.activation(r, t) for r, t in zip(recordings, begin)
-            ]
+            driven = np.array([self.working.activation(r, t) for r, t in zip(recordings, begin)])
+            act = np.where(self.hidden, 0.0 if act is None else act, driven)
+            batch.bind("act")[:n] = act
         # sensordata belongs to the state before a step, so sensors need one step more
-        record = ("qpos", "qvel", "sensordata") if sensors else ("qpos", "qvel")
+        record = ["qpos", "qvel"] + ["sensordata"] * sensors + ["act"] * bool(self.hidden.any())
         out = {
             f: np.full((n, count + sensors, getattr(self.working.data, f).size), np.nan)
             for f in record
@@ -171,7 +185,12 @@ class Engine:
         q[failed, 1:] = v[failed, 1:] = np.nan
         if sensors:
             out["sensordata"][failed] = np.nan
-        return q, v, out.get("sensordata")
+        if "act" in out:
+            act = np.concatenate([act[:, None], out["act"][:, :count]], axis=1)
+            act[failed, 1:] = np.nan
+        else:
+            act = np.zeros((n, 1 + count, self.model.na))
+        return q, v, out.get("sensordata"), act
 
     def _rollout(self, batch, drives, out):
         """Run all steps in one call; fill out, return which simulations failed (n,)."""

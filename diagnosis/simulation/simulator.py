@@ -70,7 +70,10 @@ class World:
                     [j.damping[0], 0, 0],
                     [0, 0],
                 )
-        self.candidates, taken = [], {e.name for e in (*self.spec.actuators, *self.spec.joints)}
+        self.candidates, taken = (
+            [],
+            {e.name for e in (*self.spec.actuators, *self.spec.joints, *self.spec.tendons)},
+        )
         for effect in EFFECTS:
             for name in effect.places(self.model):
                 if (

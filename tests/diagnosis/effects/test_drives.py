@@ -1,9 +1,11 @@
 """Physics of drives against a pendulum integrated here, by its own equations, at a hundredth of the step."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
-from plants import SIZES, arm, commanded, pendulum
+from plants import SIZES, arm, commanded, pendulum, stock
 
 from diagnosis.effects.drives import FrictionCurve, friction_curve
 from diagnosis.simulation.simulator import Window, World
@@ -153,3 +155,104 @@ def test_only_a_position_servo_has_gains_of_its_own():
     for kind, count in kinds.items():
         names = [c.effect.name for c in arm(kind)[0].candidates]
         assert names.count("servo_stiffness") == names.count("servo_damping") == count
+
+
+def test_bristles_bend_before_they_slip():
+    """Dahl's model by hand, exact in the bristle over each small step; and as written into MJCF."""
+    level, stiffness, h = 0.12, 1.5, 1e-5
+    recording = waves()
+    world, expected, q, v, z = pendulum(), [0.0], 0.0, 0.0, 0.0
+    for row in range(ROWS - 1):
+        for _ in range(round(DT / h)):
+            goal = level / stiffness * np.sign(v)
+            z = goal + (z - goal) * np.exp(-abs(v) * h * stiffness / level)
+            v += h / INERTIA * (recording.ctrl[row, 0] - WEIGHT * np.sin(q) - stiffness * z)
+            q += h * v
+        expected.append(q)
+    candidate = world.candidate("presliding", "j")
+    setting = {candidate: (level, stiffness)}
+    qpos = run(world, setting, recording, 0.0, 0.0)
+    assert abs(qpos - expected).max() < 6e-3
+    assert abs(run(world, {}, recording, 0.0, 0.0) - expected).max() > 0.1
+    xml, written = world.corrected_xml(setting)
+    assert written == {candidate: "mjcf"}
+    there = stock(xml, world, recording, [0.0], [0.0], ROWS)[:, 0]
+    np.testing.assert_allclose(there, qpos, rtol=0, atol=1e-9)
+
+
+def test_a_window_begins_with_the_bristle_as_it_was():
+    """What a window in the middle of a run does not show, the bend of the bristles, follows from what was recorded before."""
+    world, recording = pendulum(), waves()
+    setting = {world.candidate("presliding", "j"): (0.12, 1.5)}
+    windows = [Window(recording, 0, ROWS - 1)]
+    q, v = (x[0] for x in world.simulate([setting], [[0.0]], [[0.0]], windows))
+    recording = replace(recording, qpos=q, qvel=v)
+    middle = [Window(recording, 60, ROWS - 1)]
+    (again,) = world.simulate([setting], q[60:61], v[60:61], middle)[0]
+    assert abs(again - q[60:]).max() < 2e-4
+
+
+def test_an_elastic_joint_is_two_inertias_on_a_spring():
+    """Motor and link by hand; the sensor sees the motor."""
+    xml = SERVO.replace('axis="0 1 0"/>', 'axis="0 1 0" armature="0.01"/>')
+    world, recording = World(mujoco.MjSpec.from_string(xml)), waves()
+    k, c, h = 6.0, 0.02, 1e-5
+    expected, motor, link = [0.0], np.zeros(2), np.zeros(2)
+    for row in range(ROWS - 1):
+        for _ in range(round(DT / h)):
+            passed = k * (motor[0] - link[0]) + c * (motor[1] - link[1])
+            drive = servo(*motor, recording.ctrl[row, 0], 0.0)
+            motor[1] += h / 0.01 * (drive - passed)
+            link[1] += h / INERTIA * (passed - WEIGHT * np.sin(link[0]))
+            motor[0], link[0] = motor[0] + h * motor[1], link[0] + h * link[1]
+        expected.append(motor[0])
+    candidate = world.candidate("joint_elasticity", "j")
+    setting = {candidate: (k, c)}
+    qpos = run(world, setting, recording, 0.0, 0.0)
+    assert abs(qpos - expected).max() < 6e-3
+    assert abs(run(world, {}, recording, 0.0, 0.0) - expected).max() > 0.05
+    xml, written = world.corrected_xml(setting)
+    assert written == {candidate: "mjcf"}
+    there = stock(xml, world, recording, [0.0], [0.0], ROWS)[:, 0]
+    np.testing.assert_allclose(there, qpos, rtol=0, atol=1e-9)
+
+
+TWO = """<mujoco><option timestep="0.001" gravity="0 0 0" integrator="implicitfast"/><worldbody><body><joint name="a" axis="0 0 1"/>
+<inertial pos="0 0 0" mass="1" diaginertia=".02 .02 .02"/><body name="wrist"><joint name="b" axis="0 0 1"/>
+<inertial pos="0 0 0" mass=".5" diaginertia=".01 .01 .01"/></body></body></worldbody>
+<actuator><motor name="ma" joint="a"/><motor name="mb" joint="b"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("effect, value", [("coupled_friction", 0.06), ("coupled_inertia", 0.015)])
+def test_what_two_joints_turn_together(effect, value):
+    """Two discs on one axle: M = [[.03, .01], [.01, .01]], and a rotor or dry friction in the sum of the joints."""
+    world, h, time = World(mujoco.MjSpec.from_string(TWO)), 1e-4, np.arange(ROWS) * DT
+    ctrl = 0.1 * np.stack([np.sin(9 * time), np.cos(13 * time)], axis=1)
+    recording = commanded(time, ctrl, 2)
+    inertia, both = np.array([[0.03, 0.01], [0.01, 0.01]]), np.ones(2)
+    if effect == "coupled_inertia":
+        inertia = inertia + value
+    mobility = np.linalg.inv(inertia)
+    expected, q, v = [np.zeros(2)], np.zeros(2), np.zeros(2)
+    for row in range(ROWS - 1):
+        for _ in range(round(DT / h)):
+            v = v + h * mobility @ ctrl[row]
+            if (
+                effect == "coupled_friction"
+            ):  # stops the sum of the speeds, or opposes it with all it has
+                most = h * value
+                push = np.clip(-v.sum() / (both @ mobility @ both), -most, most)
+                v = v + push * mobility @ both
+            q = q + h * v
+        expected.append(q)
+    candidate, window = world.candidate(effect, "a+b"), [Window(recording, 0, ROWS - 1)]
+    start = np.zeros((1, 2)), np.zeros((1, 2))
+    qpos = world.simulate([{candidate: (value,)}], *start, window)[0][0]
+    assert abs(qpos - expected).max() < 6e-3
+    assert abs(world.simulate([{}], *start, window)[0][0] - expected).max() > 0.05
+    xml, written = world.corrected_xml({candidate: (value,)})
+    assert written == {candidate: "mjcf"}
+    there = stock(xml, world, recording, np.zeros(2), np.zeros(2), ROWS)
+    np.testing.assert_allclose(there, qpos, rtol=0, atol=1e-9)
+    again = World(mujoco.MjSpec.from_string(xml))  # which has it already
+    assert candidate not in again.candidates and world.joints(candidate.place) == {0, 1}
