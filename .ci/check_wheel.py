@@ -1,4 +1,5 @@
-"""Build the wheel and check what it holds: one package, with its templates, style, script and schema.
+"""Build the wheel and check what it holds: one package, with its templates, style, script and
+schema.
 
 python .ci/check_wheel.py
 """

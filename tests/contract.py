@@ -36,7 +36,8 @@ SCHEMA = {
 
 
 def conforms(value, schema, where="$"):
-    """Asserts that value has the schema's shape: dicts with at least these keys, lists of one form, types."""
+    """Asserts that value has the schema's shape: dicts with at least these keys, lists of one form,
+    types."""
     if isinstance(schema, dict):
         assert isinstance(value, dict), where
         for key, inner in schema.items():
@@ -59,8 +60,8 @@ def validator():
 
 
 def contract(summary):
-    """Asserts everything the contract says of diagnosis.json. The shape is the schema file's; format
-    1, from before that file, has one of its own here."""
+    """Asserts everything the contract says of diagnosis.json. The shape is the schema file's;
+    format 1, from before that file, has one of its own here."""
     if summary["format"] == 1:
         conforms(summary, SCHEMA)
         assert summary["verdict"] in ("match", "mismatch")

@@ -1,7 +1,9 @@
-"""Inputs that must be refused, made by code: one sound set of files, and some eighty ways to spoil it.
+"""Inputs that must be refused, made by code: one sound set of files, and some eighty ways to spoil
+it.
 
 for name, case in cases().items():
-    argv = case.write(folder)        # the command line; must give exit status 2 and one line that holds case.says
+    argv = case.write(folder)        # the command line; must give exit status 2 and one line that
+    holds case.says
 """
 
 import gzip
@@ -52,7 +54,8 @@ def arm():
 
 
 def run(seconds=4.0, seed=0, noise=2e-4, amplitude=1.0):
-    """(T, 7) a sound recording of ARM, columns as in HEADER: random smooth torques, sampled every DT."""
+    """(T, 7) a sound recording of ARM, columns as in HEADER: random smooth torques, sampled every
+    DT."""
     rng = np.random.default_rng(seed)
     model = arm()
     data = mujoco.MjData(model)
@@ -100,7 +103,8 @@ def whole(table):
 
 @dataclass
 class Case:
-    """files: {name: bytes} to write; argv with {dir} for their folder; says: what the line must hold."""
+    """files: {name: bytes} to write; argv with {dir} for their folder; says: what the line must
+    hold."""
 
     files: dict
     says: str

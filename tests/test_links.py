@@ -1,4 +1,5 @@
-"""README and docs: relative links lead to files and headings that are there, and README stays short."""
+"""README and docs: relative links lead to files and headings that are there, and README stays
+short."""
 
 import re
 from pathlib import Path

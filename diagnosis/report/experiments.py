@@ -9,7 +9,8 @@ from diagnosis.report.text import effect_words, place_words
 SEPARATING = [
     (
         {"viscous_damping", "back_emf"},
-        "back-drive the joint with the motor disconnected: damping of the joint stays, back-EMF goes",
+        "back-drive the joint with the motor disconnected: damping of the joint stays, back-EMF "
+        "goes",
     ),
     (
         {"delay", "lag"},
@@ -21,7 +22,8 @@ SEPARATING = [
     ),
     (
         {"coulomb_friction", "stribeck_friction"},
-        "reverse slowly many times, at a tenth of the usual speed: only Stribeck friction falls as motion starts",
+        "reverse slowly many times, at a tenth of the usual speed: only Stribeck friction falls "
+        "as motion starts",
     ),
     (
         {"coulomb_friction", "dead_zone"},
@@ -40,7 +42,8 @@ SEPARATING = [
             "air_drag",
             "back_emf",
         },
-        "let it coast from several speeds, slow and fast: the force against speed is flat, straight or curved",
+        "let it coast from several speeds, slow and fast: the force against speed is flat, "
+        "straight or curved",
     ),
     (
         {"quadratic_damping", "air_drag", "wind", "mass"},
@@ -48,11 +51,13 @@ SEPARATING = [
     ),
     (
         {"mass", "gain", "armature", "inertia", "sensor_scale", "payload_change"},
-        "attach a known weight, or measure the actuator's force directly: it fixes the scale that motion alone leaves open",
+        "attach a known weight, or measure the actuator's force directly: it fixes the scale that "
+        "motion alone leaves open",
     ),
     (
         {"mass", "center_of_mass", "inertia", "link_length", "gravity"},
-        "hold still in several poses and note the holding force: statics show mass times distance, motion then the inertia",
+        "hold still in several poses and note the holding force: statics show mass times "
+        "distance, motion then the inertia",
     ),
     (
         {
@@ -65,7 +70,8 @@ SEPARATING = [
             "payload_change",
             "center_of_mass",
         },
-        "record the same motion with the mechanism turned on its side or its base tilted, and once with the actuator off",
+        "record the same motion with the mechanism turned on its side or its base tilted, and "
+        "once with the actuator off",
     ),
     (
         {
@@ -77,7 +83,8 @@ SEPARATING = [
             "cogging",
             "gravity",
         },
-        "move slowly through the whole range, both ways: the force against position shows its shape",
+        "move slowly through the whole range, both ways: the force against position shows its "
+        "shape",
     ),
     (
         {"saturation", "gain", "dead_zone", "nonlinear_stiffness", "joint_stop"},
@@ -96,7 +103,8 @@ OTHERWISE = "record larger and faster motion, and motion in which only one of th
 
 
 def _way(one, other):
-    """The experiment that separates two effects; the same effect at two places needs motion of only one."""
+    """The experiment that separates two effects; the same effect at two places needs motion of only
+    one."""
     return next(
         (way for both, way in SEPARATING if one != other and {one, other} <= both), OTHERWISE
     )

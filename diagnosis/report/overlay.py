@@ -1,4 +1,5 @@
-"""Recorded motion beside that of the nominal and the corrected model, for pictures: stock MuJoCo, no catalogue."""
+"""Recorded motion beside that of the nominal and the corrected model, for pictures: stock MuJoCo,
+no catalogue."""
 
 import mujoco
 import numpy as np
@@ -8,7 +9,8 @@ BEFORE = 1.0  # s, over which actuator states and delayed controls run on to the
 
 
 def poses(model, recordings, count=4):
-    """[(nq,)] recorded poses, evenly spread over the longest recording; unmeasured joints stay at their reference."""
+    """[(nq,)] recorded poses, evenly spread over the longest recording; unmeasured joints stay at
+    their reference."""
     longest = max((r.seen() for r in recordings), key=lambda recording: len(recording.time))
     rows = np.linspace(0.5, 0.98, count) * (len(longest.time) - 1)
     return [whole(model, longest.qpos[int(row)]) for row in rows]
@@ -20,11 +22,12 @@ def whole(model, qpos):
 
 
 def simulate(model, recording, first, last, columns):
-    """(last - first + 1, nq) from the recorded state of row `first` under the recorded control. columns: (qpos, dof)
-    indices of the recorded coordinates within `model`. NaN from where the simulation blows up.
+    """(last - first + 1, nq) from the recorded state of row `first` under the recorded control.
+    columns: (qpos, dof) indices of the recorded coordinates within `model`. NaN from where the
+    simulation blows up.
 
-    Actuator states and delayed controls come from the control before `first`, the mechanism held where it was recorded;
-    before the recording's first row it is that row's."""
+    Actuator states and delayed controls come from the control before `first`, the mechanism held
+    where it was recorded; before the recording's first row it is that row's."""
     data = mujoco.MjData(model)
     before = (
         round(BEFORE / model.opt.timestep) if model.na or (model.actuator_delay > 0).any() else 0
@@ -68,7 +71,8 @@ def simulate(model, recording, first, last, columns):
 
 
 def velocity(model, recording, row, columns):
-    """(nv,) measured at `row`, else by the slope over the rows around it; 0 where neither is known."""
+    """(nv,) measured at `row`, else by the slope over the rows around it; 0 where neither is
+    known."""
     before, after = max(0, row - 2), min(len(recording.time) - 1, row + 2)
     full = [np.array(model.qpos0) for _ in (before, after)]
     for pose, at in zip(full, (before, after)):
@@ -81,7 +85,8 @@ def velocity(model, recording, row, columns):
 
 
 def columns_in(model, nominal):
-    """(qpos, dof) indices in `model` of the nominal model's coordinates: joints by name, unnamed ones in their order."""
+    """(qpos, dof) indices in `model` of the nominal model's coordinates: joints by name, unnamed
+    ones in their order."""
     qpos, dof = [], []
     unnamed = [j for j in range(model.njnt) if not model.joint(j).name]
     for j in range(nominal.njnt):
@@ -94,54 +99,51 @@ def columns_in(model, nominal):
 
 
 def overlay(diagnosis):
-    """(recording's name, start in s, seconds, {"measured" | "nominal" | "corrected": (F, nq)}) of the held-out stretch of
-    at most SECONDS that the nominal model predicts worst, or None where there is nothing to compare."""
+    """(recording's name, start in s, seconds, {"measured" | "nominal" | "corrected": (F, nq)}) of
+    the held-out stretch of at most SECONDS that the nominal model predicts worst, or None where
+    there is nothing to compare."""
     nominal = diagnosis.world.model
     corrected = mujoco.MjModel.from_xml_string(diagnosis.corrected_xml)
     models = {
         "nominal": (nominal, columns_in(nominal, nominal)),
         "corrected": (corrected, columns_in(corrected, nominal)),
     }
-    worst = None
-    for recording in (r.seen() for r in diagnosis.held_out[:8]):
-        end = np.searchsorted(
-            recording.time, recording.time[-1] - min(SECONDS, 0.9 * np.ptp(recording.time))
-        )
-        for first in sorted({int(k) for k in np.linspace(0, end, 6)}):
-            last = (
-                int(np.searchsorted(recording.time, recording.time[first] + SECONDS, side="right"))
-                - 1
-            )
-            if last - first < 4:
-                continue
-            predicted = simulate(nominal, recording, first, last, models["nominal"][1])
-            apart = (
-                np.nanmean((predicted - recording.qpos[first : last + 1]) ** 2)
-                if np.isfinite(predicted).any()
-                else 0
-            )
-            if worst is None or apart > worst[0]:
-                worst = apart, recording, first, last
-    if worst is None or worst[0] == 0:
+    worst = _worst(nominal, diagnosis.held_out, models["nominal"][1])
+    if worst is None:
         return None
-    _, recording, first, last = worst
-    rows = np.unique(np.linspace(0, last - first, min(FRAMES, last - first + 1)).astype(int))
+    recording, first, last = worst
     motions = {"measured": whole(nominal, recording.qpos[first : last + 1])}
-    motions.update(
-        {
-            look: simulate(model, recording, first, last, columns)
-            for look, (model, columns) in models.items()
-        }
-    )
+    for look, (model, columns) in models.items():
+        motions[look] = simulate(model, recording, first, last, columns)
     if not any(finding["written_as"] == "mjcf" for finding in diagnosis.summary["findings"]):
         del motions["corrected"]  # it is the nominal one
-    for look, qpos in motions.items():  # a simulation that blew up stays where it was last
-        for k in range(1, len(qpos)):
-            qpos[k] = np.where(np.isnan(qpos[k]), qpos[k - 1], qpos[k])
-        motions[look] = qpos[rows]
-    return (
-        recording.name,
-        float(recording.time[first]),
-        float(recording.time[last] - recording.time[first]),
-        motions,
-    )
+    rows = np.unique(np.linspace(0, last - first, min(FRAMES, last - first + 1)).astype(int))
+    motions = {look: _held(qpos)[rows] for look, qpos in motions.items()}
+    time = recording.time
+    return recording.name, float(time[first]), float(time[last] - time[first]), motions
+
+
+def _worst(model, recordings, columns):
+    """(recording, first row, last row) of the stretch that a model predicts worst; None without."""
+    worst, stretch = 0.0, None
+    for recording in (r.seen() for r in recordings[:8]):
+        time = recording.time
+        end = np.searchsorted(time, time[-1] - min(SECONDS, 0.9 * np.ptp(time)))
+        for first in sorted({int(k) for k in np.linspace(0, end, 6)}):
+            last = int(np.searchsorted(time, time[first] + SECONDS, side="right")) - 1
+            if last - first < 4:
+                continue
+            predicted = simulate(model, recording, first, last, columns)
+            if not np.isfinite(predicted).any():
+                continue
+            apart = np.nanmean((predicted - recording.qpos[first : last + 1]) ** 2)
+            if apart > worst:
+                worst, stretch = apart, (recording, first, last)
+    return stretch
+
+
+def _held(qpos):
+    """A motion (n, nq) in which what blew up stays where it was last."""
+    for k in range(1, len(qpos)):
+        qpos[k] = np.where(np.isnan(qpos[k]), qpos[k - 1], qpos[k])
+    return qpos

@@ -21,6 +21,9 @@ ALWAYS_THERE = {
     "ground_height",
     "link_length",
 }  # a nominal 0 of theirs is a value like any other
+UNSTEADY = 0.01  # p, below which recordings do not agree on one value
+NO_EFFECT = "no effect of the catalogue improves the prediction of recordings held out."
+UNSEEN = "not seen in these recordings"
 MUCH = 0.5  # of the squared error above the noise: no match, though nothing is named
 SMALL = {
     "rad": ("mrad", 1e3),
@@ -55,8 +58,11 @@ def number(value, digits=3):
 
 
 def estimate(parameter):
-    """A parameter with its 95 % interval, to the digits the interval warrants: "0.121 ± 0.004 N·m"."""
+    """A parameter with its 95 % interval, to the digits the interval warrants: "0.121 ± 0.004
+    N·m"."""
     value, low, high, unit = (parameter.get(key) for key in ("value", "low", "high", "unit"))
+    if value is None:
+        return UNSEEN
     unit = f" {unit}" if unit and unit != "1" else ""
     if low is None or high is None or not high > low:
         return number(value) + unit
@@ -91,7 +97,8 @@ def finding_words(finding):
                 0.25 / (other["at"] - one["at"]),
                 math.hypot(one["value"], other["value"]),
             )
-            return f"{unnamed}, repeating {number(hertz)} times a second with an amplitude of {number(amplitude)} {one['unit']}"
+            wave = f"repeating {number(hertz)} times a second with an amplitude of"
+            return f"{unnamed}, {wave} {number(amplitude)} {one['unit']}"
         return unnamed + (f", depending on {on}" if on else "") + when_words(finding.get("when"))
     parameters, ends = finding["parameters"], ""
     absent = [
@@ -100,7 +107,8 @@ def finding_words(finding):
     if absent and len(absent) < len(parameters):  # a stop on one side only
         ends = " (" + " and ".join(no_stop(p["name"], p["value"]) for p in absent) + ")"
     parameters = [p for p in parameters if p not in absent]
-    parameters = [p for p in parameters if p["value"] != p["nominal"]] or parameters
+    seen = [p for p in parameters if p["value"] is not None and p["value"] != p["nominal"]]
+    parameters = seen or parameters
     if not parameters:
         return f"{place}: {effect}"
     if not there(finding["effect"], parameters[0]):
@@ -121,14 +129,16 @@ def finding_words(finding):
 
 
 def there(effect, parameter):
-    """Whether the nominal model has some of an effect, so that a parameter of it is wrong rather than left out."""
+    """Whether the nominal model has some of an effect, so that a parameter of it is wrong rather
+    than left out."""
     if effect == "joint_stop":
         return no_stop(parameter["name"], parameter["nominal"]) is None
     return effect in ALWAYS_THERE or parameter["nominal"] not in (0, None, math.inf, -math.inf)
 
 
 def no_stop(name, value):
-    """ "no stop below" or "no stop above" of a joint stop's bound that is out of reach, else None."""
+    """ "no stop below" or "no stop above" of a joint stop's bound that is out of reach, else
+    None."""
     if name in ("low", "high") and (value is None or not abs(value) < JointStop.NEVER):
         return f"no stop {'below' if name == 'low' else 'above'}"
     return None
@@ -137,7 +147,7 @@ def no_stop(name, value):
 def change(parameter):
     """ "4.52 ± 0.03 kg instead of 3.56 (+27 %)"."""
     nominal, stop = parameter["nominal"], no_stop(parameter["name"], parameter["value"])
-    if nominal is None or math.isinf(nominal):
+    if nominal is None or math.isinf(nominal) or parameter["value"] is None:
         return stop or estimate(parameter)
     if stop:
         return f"{stop} instead of {number(nominal)} {parameter['unit']}"
@@ -190,14 +200,15 @@ def depends_words(depends_on):
 
 
 def errors(summary):
-    """Held-out error (before, after, floor, unit, place), three numbers and two texts: in SI at the channel that the
-    correction betters most (or worsens most, where it worsens the whole), or, where they are the same, which is farthest from a
-    perfect one; or over all channels in multiples of the noise. Infinite: the model blows up."""
+    """Held-out error (before, after, floor, unit, place), three numbers and two texts: in SI at the
+    channel that the correction betters most (or worsens most, where it worsens the whole), or,
+    where they are the same, which is farthest from a perfect one; or over all channels in multiples
+    of the noise. Infinite: the model blows up."""
     fit, place, factor = summary["fit"]["held_out"], "", 1
     unit = "times the noise"
     channels = {name: _infinite(c) for name, c in (fit.get("channels") or {}).items() if c["floor"]}
     if channels:
-        match = summary["verdict"] == "match"
+        match = summary["verdict"] == "match" or not summary["findings"]
         whole = _infinite(fit)
         sign = -1 if whole["after"] > whole["before"] else 1
         gains = {
@@ -220,14 +231,16 @@ def _infinite(fit):
 
 
 def channel_words(name):
-    """ "qpos:elbow" -> "elbow", "qpos:root:rot" -> "root (rotation)"; a joint without a name goes by its index."""
+    """ "qpos:elbow" -> "elbow", "qpos:root:rot" -> "root (rotation)"; a joint without a name goes
+    by its index."""
     joint, _, part = name.split(":", 1)[1].partition(":")
     part = {"pos": " (position)", "rot": " (rotation)"}.get(part, f":{part}" if part else "")
     return ("joint " if joint.isdigit() else "") + joint + part
 
 
 def error_words(summary):
-    """ "held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; a perfect simulator's would be 1, from noise in ..."."""
+    """ "held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; a perfect simulator's would be
+    1, from noise in ..."."""
     *values, unit, place = errors(summary)
     before, after, floor = (number(value, 2) for value in values)
     blown = [not math.isfinite(value) for value in values[:2]]
@@ -237,16 +250,18 @@ def error_words(summary):
         which = "" if summary["verdict"] == "match" else "corrected "
         return f"{ahead} has no number, for the {which}model blows up{place}; {perfect}"
     if blown[1]:
-        return f"{ahead} is {before} {unit}{place} with the nominal model, but the corrected one blows up; {perfect}"
+        nominal = f"{before} {unit}{place} with the nominal model"
+        return f"{ahead} is {nominal}, but the corrected one blows up; {perfect}"
     if blown[0]:
         return f"{ahead} is {after} {unit}{place}, where the nominal model blows up; {perfect}"
     fit = _infinite(summary["fit"]["held_out"])
+    falls = "falls" if fit["after"] < fit["before"] else "goes"
     change = (
         f"is {before} {unit}"
         if summary["verdict"] == "match"
         else f"stays at {after} {unit}"
         if before == after
-        else f"{'falls' if fit['after'] < fit['before'] else 'goes'} from {before} to {after} {unit}"
+        else f"{falls} from {before} to {after} {unit}"
     )
     return f"{ahead} {change}{place}; {perfect}"
 
@@ -276,10 +291,13 @@ def unexplained_words(summary):
 
 def verdict_words(summary):
     """The first line of everything."""
+    if summary["verdict"] == "unresolved":
+        nearest = "; the nearest names are these." if summary["findings"] else "."
+        return f"Something is missing, and no name explains it well enough{nearest}"
     if summary["verdict"] == "match":
         if ((summary.get("unexplained") or {}).get("fraction") or 0) > MUCH:
-            return "Something is missing, but no effect of the catalogue improves the prediction of recordings held out."
-        return "Nothing is missing: no effect of the catalogue improves the prediction of recordings held out."
+            return f"Something is missing, but {NO_EFFECT}"
+        return f"Nothing is missing: {NO_EFFECT}"
     count = len(summary["findings"])
     return (
         "One thing is wrong with the simulator."
@@ -289,7 +307,8 @@ def verdict_words(summary):
 
 
 def terminal(summary, out, files):
-    """The summary for the terminal, several lines; the last names the files written into folder out."""
+    """The summary for the terminal, several lines; the last names the files written into folder
+    out."""
     lines = [verdict_words(summary)]
     for finding in summary["findings"]:
         lines.append(f"  {finding_words(finding)}")
@@ -298,6 +317,7 @@ def terminal(summary, out, files):
             for other in finding.get("also_possible") or []
         )
         lines += [f"    (these recordings cannot tell it from: {rivals})"] if rivals else []
+        lines += [f"    ({doubt})" for doubt in doubts(finding)]
     lines.append(sentence(error_words(summary)))
     left = unexplained_words(summary)
     lines += [sentence(left)] if left else []
@@ -306,6 +326,19 @@ def terminal(summary, out, files):
     lines += [f"({len(warnings) - 8} more notes are in the report)"] if len(warnings) > 8 else []
     lines.append(f"Written: {out}/{', '.join(files)}")
     return "\n".join(lines)
+
+
+def doubts(finding):
+    """What speaks against the name of a finding, a few words each."""
+    found = []
+    if finding.get("adequate") is False:
+        found.append("the nearest name only: the rest of its force depends on something still")
+    if finding.get("strains"):
+        found.append(f"hard to believe: {finding['strains']}")
+    constancy = finding.get("constancy")
+    if constancy is not None and constancy < UNSTEADY:
+        found.append(f"the recordings do not agree on one value: p {p_value(constancy)}")
+    return found
 
 
 def sentence(words):

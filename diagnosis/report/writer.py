@@ -1,4 +1,5 @@
-"""The three files of a diagnosis: diagnosis.json to compute with, corrected.xml to simulate with, report.html to look at (sections)."""
+"""The three files of a diagnosis: diagnosis.json to compute with, corrected.xml to simulate with,
+report.html to look at (sections)."""
 
 import html
 import itertools
@@ -10,7 +11,8 @@ import re
 import numpy as np
 
 from diagnosis.common.atomic_files import WriteError, write_together
-from diagnosis.report.sections import html_page, reads_files, unknown_curves
+from diagnosis.report.cards import unknown_curves
+from diagnosis.report.sections import html_page, reads_files
 
 
 class ReportError(ValueError):
@@ -34,11 +36,13 @@ def check_folder(out):
 
 
 def write(diagnosis, out):
-    """Write report.html, diagnosis.json, corrected.xml and a curve for each unknown force into folder `out`; their names.
+    """Write report.html, diagnosis.json, corrected.xml and a curve for each unknown force into
+    folder `out`; their names.
 
-    A curve is unknown_<n>.csv, the first n that is free, and named in its finding as `saved_as`; those of the earlier
-    diagnosis in the folder go. All are complete under temporary names before the first takes its own. Raises ReportError
-    where that fails; what was in the folder before is then unchanged.
+    A curve is unknown_<n>.csv, the first n that is free, and named in its finding as `saved_as`;
+    those of the earlier diagnosis in the folder go. All are complete under temporary names before
+    the first takes its own. Raises ReportError where that fails; what was in the folder before is
+    then unchanged.
     """
     summary, earlier = plain(diagnosis.summary), _earlier(out)
     names = (f"unknown_{n}.csv" for n in itertools.count(1))
@@ -68,7 +72,8 @@ def write(diagnosis, out):
 
 
 def portable(xml, out):
-    """MJCF for folder `out`: where it reads files, folders of meshes and textures as seen from there, else without them."""
+    """MJCF for folder `out`: where it reads files, folders of meshes and textures as seen from
+    there, else without them."""
     reads = reads_files(xml)
 
     def seen(match):
@@ -105,7 +110,8 @@ def _earlier(out):
 
 
 def _csv(curve):
-    """A curve as it acts: its variable, what it is multiplied by, if anything (at -1 and at 1: it is proportional), force."""
+    """A curve as it acts: its variable, what it is multiplied by, if anything (at -1 and at 1: it
+    is proportional), force."""
     factor, levels = curve["factor"], (-1.0, 1.0) if curve["factor"] else (1.0,)
     head = [curve["variable"]] + ([_multiplier(factor)] if factor else []) + ["force"]
     rows = [

@@ -8,7 +8,6 @@ import re
 import shutil
 import stat
 import subprocess
-import types
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -16,13 +15,14 @@ import mujoco
 import numpy as np
 import pytest
 from contract import SCHEMA, conforms, contract
-from malformed import ARM, arm, run
+from malformed import ARM, arm
+from report_example import example, finding, recordings
 
 from diagnosis import findings
 from diagnosis.effects import EFFECTS, unmodelled
 from diagnosis.recordings import inverse_dynamics
 from diagnosis.recordings.recording import Recording
-from diagnosis.report import charts, experiments, mechanism, overlay, sections, writer
+from diagnosis.report import charts, experiments, mechanism, outlines, overlay, sections, writer
 from diagnosis.report import text as wording
 from diagnosis.simulation.simulator import World
 
@@ -37,153 +37,10 @@ BROWSER = next(
 )
 
 
-def finding(effect, kind, name, nominal, value, half, unit, **more):
-    return {
-        "effect": effect,
-        "place": {"kind": kind, "name": name},
-        "parameters": [
-            {
-                "name": "value",
-                "nominal": nominal,
-                "value": value,
-                "low": value - half,
-                "high": value + half,
-                "unit": unit,
-            }
-        ],
-        "evidence": {"held_out_error_removed": 0.6, "p_value": 1e-40},
-        "depends_on": [f"velocity:{name}"],
-        "when": None,
-        "written_as": "mjcf",
-        "also_possible": [],
-        **more,
-    }
-
-
-def recordings(count, seed):
-    return [
-        Recording(f"run{seed + k}.csv", t[:, 0], t[:, 1:3], t[:, 3:5], t[:, 5:7])
-        for k, t in enumerate(run(3.0, seed + s) for s in range(count))
-    ]
-
-
 @pytest.fixture
 def diagnosis():
-    """A diagnosis as identify makes them, of ARM with friction at the elbow, numbers made up."""
-    train, held = recordings(2, 0), recordings(1, 5)
-    findings = [
-        finding(
-            "coulomb_friction",
-            "joint",
-            "elbow",
-            0.0,
-            0.12,
-            0.004,
-            "N·m",
-            also_possible=[
-                {
-                    "effect": "dead_zone",
-                    "place": {"kind": "actuator", "name": "elbow_motor"},
-                    "parameters": [
-                        {"name": "half_width", "nominal": 0.0, "value": 0.11, "unit": "N·m"}
-                    ],
-                }
-            ],
-        ),
-        finding("mass", "body", "lower", 0.5, 0.55, 0.01, "kg"),
-        finding(
-            "gravity", "world", "world", -9.81, np.float64(-9.7), 0.02, "m/s²", written_as="none"
-        ),
-    ]
-    channels = {
-        f"qpos:{name}": {"before": 0.03, "after": 0.002, "floor": 0.001, "unit": "rad"}
-        for name in ("shoulder", "elbow")
-    }
-    curve = [
-        {"seconds": s, "before": 30 * s + 1, "after": 2 * s + 1, "floor": 1.0}
-        for s in np.linspace(0.05, 1, 12)
-    ]
-    curve[-1]["blown_up"] = {"before": 3, "after": 0, "of": 40}
-    summary = {
-        "format": 1,
-        "verdict": "mismatch",
-        "noise": {"qpos:shoulder": 0.001, "qpos:elbow": np.float32(0.001)},
-        "findings": findings,
-        "fit": {
-            "train": {"before": 31.0, "after": 2.0, "floor": 1.0},
-            "held_out": {
-                "before": 30.0,
-                "after": 2.0,
-                "floor": 1.0,
-                "horizon_s": 0.3,
-                "curve": curve,
-                "channels": channels,
-                "sensors": {
-                    "gyro <1>": {"before": 0.3, "after": 0.02, "noise": 0.01, "unit": "rad/s"}
-                },
-            },
-        },
-        "unexplained": {
-            "fraction": 0.05,
-            "place": {"kind": "joint", "name": "elbow"},
-            "depends_on": ["position:elbow"],
-        },
-        "warnings": ["run5.csv: ctrl:elbow_motor <stays> at its extreme"],
-    }
-    traces = [
-        {
-            "recording": r.name,
-            "channel": f"qpos:{name}",
-            "time": r.time,
-            "measured": r.qpos[:, k],
-            "nominal": r.qpos[:, k] + 0.1,
-            "corrected": np.where(np.arange(len(r.time)) % 30 == 0, np.nan, r.qpos[:, k]),
-        }
-        for r in held
-        for k, name in enumerate(("shoulder", "elbow"))
-    ]
-    ranking = [
-        {
-            "effect": "coulomb_friction",
-            "place": {"kind": "joint", "name": "elbow"},
-            "error_removed": 0.6,
-            "p_value": 0.0,
-        },
-        {
-            "effect": "wind",
-            "place": {"kind": "world", "name": "world"},
-            "error_removed": float("nan"),
-            "p_value": float("nan"),
-        },
-    ]
-    knots, force = np.linspace(-1, 1, 9), np.linspace(0, 1, 9)
-    findings.append(
-        {
-            **finding("unknown", "joint", "shoulder", 0, 0, 1, "", depends_on=["position:elbow"]),
-            "parameters": [
-                {
-                    "name": f"force {k}",
-                    "nominal": 0.0,
-                    "value": f,
-                    "low": f - 0.1,
-                    "high": f + 0.1,
-                    "unit": "N·m",
-                    "at": x,
-                }
-                for k, (x, f) in enumerate(zip(knots, force))
-            ],
-        }
-    )
-    return types.SimpleNamespace(
-        summary=summary,
-        corrected_xml=ARM.replace('range="-2.9', 'frictionloss="0.12" range="-2.9'),
-        world=types.SimpleNamespace(model=arm()),
-        settings={unmodelled.curve(arm(), "shoulder", "position:elbow", knots): force},
-        ranking=ranking,
-        traces=traces,
-        train=train,
-        held_out=held,
-    )
+    """A diagnosis as the estimator makes them, numbers made up."""
+    return example()
 
 
 @pytest.fixture
@@ -421,23 +278,23 @@ def test_thinned_curves_keep_extremes_and_gaps():
 def test_hull_against_area_of_known_shapes():
     rng = np.random.default_rng(0)
     square = np.concatenate([rng.uniform(0, 1, (200, 2)), [[0, 0], [1, 0], [1, 1], [0, 1]]])
-    corners = mechanism.hull(square)
+    corners = outlines.hull(square)
     assert sorted(map(tuple, corners)) == [(0, 0), (0, 1), (1, 0), (1, 1)]
 
 
 def test_planar_mechanisms_are_seen_along_their_hinges():
-    axes, towards = mechanism.view(arm(), np.zeros(2))
+    axes, towards = outlines.view(arm(), np.zeros(2))
     np.testing.assert_allclose(axes, [[1, 0, 0], [0, 0, 1]], atol=1e-12)  # x to the right, z up
     np.testing.assert_allclose(towards, [0, -1, 0], atol=1e-12)
 
 
 def test_outline_of_a_rod_lies_where_the_kinematics_put_it():
     model = arm()
-    axes, towards = mechanism.view(model, np.zeros(2))
+    axes, towards = outlines.view(model, np.zeros(2))
     angle = 0.7
     shapes = {
         g: outline
-        for g, outline, _ in mechanism.outlines(model, np.array([angle, 0.0]), axes, towards)
+        for g, outline, _ in outlines.outlines(model, np.array([angle, 0.0]), axes, towards)
     }
     tip = -0.55 * np.array(
         [np.sin(angle), np.cos(angle)]
@@ -531,7 +388,7 @@ def test_marks_of_actuators_that_drive_no_joint():
         <geom size=".1"/><site name="rotor" pos=".3 0 0"/></body></worldbody><tendon><spatial name="t"><site site="wall"/><site site="rotor"/>
         </spatial><fixed name="f"><joint joint="j" coef="1"/></fixed></tendon><actuator><motor name="thrust" site="rotor"/><motor name="rope"
         tendon="t"/><motor name="belt" tendon="f"/><adhesion name="glue" body="b" ctrlrange="0 1"/></actuator></mujoco>""")
-    data = mechanism._posed(model, model.qpos0)
+    data = outlines.posed(model, model.qpos0)
     points = {}
     for name in ("thrust", "rope", "belt", "glue"):
         _, point = mechanism.marked(model, {"kind": "actuator", "name": name})

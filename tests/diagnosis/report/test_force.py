@@ -1,0 +1,138 @@
+"""The missing force on the page: which variable it is drawn over, how sure it is, what is said."""
+
+import numpy as np
+import pytest
+from report_example import example
+
+from diagnosis.report import force, sections, text
+
+
+@pytest.fixture
+def diagnosis():
+    return example()
+
+
+def courses(function, seed=0, rows=400, sd=0.05):
+    """One course each of joints a and b; the force at a is function(own position, own velocity,
+    b's velocity, time) with noise of `sd`."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0, 8, rows)
+    states = rng.uniform(-1, 1, (4, rows))
+    made = []
+    for k, joint in enumerate("ab"):
+        position, velocity = states[2 * k : 2 * k + 2]
+        value = function(states[0], states[1], states[3], time) if joint == "a" else np.zeros(rows)
+        made.append(
+            {
+                "joint": joint,
+                "recording": "run1.csv",
+                "unit": "N",
+                "time": list(time),
+                "force": list(value + sd * rng.normal(size=rows)),
+                "sd": [sd] * rows,
+                "position": list(position),
+                "velocity": list(velocity),
+            }
+        )
+    return {"missing_force": made}
+
+
+@pytest.mark.parametrize(
+    "function, variable",
+    [
+        (lambda p, v, w, t: np.sign(v), "velocity:a"),
+        (lambda p, v, w, t: p**3, "position:a"),
+        (lambda p, v, w, t: np.abs(w), "velocity:b"),
+        (lambda p, v, w, t: np.where(t > 5, 1.0, 0.0), "time"),
+    ],
+)
+def test_the_variable_that_carries_the_force_is_drawn(function, variable):
+    joint = force.joints(courses(function))[0]
+    best, share = joint.best()
+    assert (joint.name, best) == ("a", variable) and share > 0.8
+    assert text.depends_words([variable]) in joint.words()
+
+
+def test_noise_is_explained_by_nothing():
+    shares, certain = [], []
+    for seed in range(20):
+        joint = force.joints(courses(lambda p, v, w, t: 0 * t, seed))[0]
+        shares.append(np.mean([force.explained(x, joint.force) for x in joint.variables.values()]))
+        certain.append(joint.certain)
+    assert np.mean(shares) < 0.03 and 0.03 < np.mean(certain) < 0.07
+
+
+def test_the_share_is_that_of_the_variances():
+    """Of a sine over its variable with noise: 0.5 / (0.5 + sd²), by theory."""
+    rng = np.random.default_rng(1)
+    x = rng.uniform(0, 2 * np.pi, 20000)
+    for sd in (0.3, 1.0):
+        y = np.sin(x) + sd * rng.normal(size=x.shape)
+        assert force.explained(x, y) == pytest.approx(0.5 / (0.5 + sd**2), abs=0.02)
+
+
+def test_means_come_with_their_standard_errors():
+    rng, off = np.random.default_rng(2), []
+    for _ in range(60):
+        x, y = rng.uniform(-1, 1, 800), rng.normal(size=800)
+        _, mean, error = force.averaged(x, y)
+        off.append(mean / error)
+    assert np.std(off) == pytest.approx(1.0, abs=0.1)
+
+
+def test_unknown_moments_are_left_out():
+    summary = courses(lambda p, v, w, t: np.sign(v))
+    course = summary["missing_force"][0]
+    course["force"][50:100] = [None] * 50
+    course["velocity"][10:20] = [None] * 10
+    joint = force.joints(summary)[0]
+    assert joint.best()[0] == "velocity:a" and np.isfinite(joint.rms)
+    _, over_time, _ = joint.pictures()
+    assert over_time.count("M") > 2 and "nan" not in over_time
+
+
+def test_the_page_begins_with_it(diagnosis):
+    page = sections.html_page(diagnosis)
+    first = page.partition("<h2>")[2]
+    assert first.startswith("Where the force is missing</h2>")
+    assert first.index("<h3>elbow</h3>") < first.index("<h3>shoulder</h3>")  # the surer one first
+    del diagnosis.summary["missing_force"]
+    assert "Where the force is missing" not in sections.html_page(diagnosis)
+
+
+def test_a_summary_for_each_joint_is_a_table(diagnosis):
+    elbow = {"rms": 0.08, "unit": "N·m", "after": None, "depends_on": ["velocity:elbow"]}
+    diagnosis.summary["missing_force"] = {"elbow": elbow}
+    page = sections.html_page(diagnosis)
+    assert "<td>0.080 N·m</td><td>– N·m</td><td>the velocity of elbow</td>" in page
+
+
+def test_doubts_stand_beside_the_name(diagnosis):
+    page = sections.html_page(diagnosis)
+    for words in (
+        "The nearest name only: the rest of its force depends on something still.",
+        "Hard to believe: 1.1 times the nominal value.",
+        "The recordings do not agree on one value: p 1.0e-5.",
+        "0.130 (0.100 to 0.140) N·m",
+        "(nearest name only)",
+    ):
+        assert words in page, words
+    said = text.terminal(diagnosis.summary, "out", ["report.html"])
+    assert "    (the nearest name only: " in said
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_unresolved_is_neither_a_match_nor_a_mismatch(diagnosis, named):
+    diagnosis.summary["verdict"] = "unresolved"
+    if not named:
+        diagnosis.summary["findings"], diagnosis.settings = [], {}
+    page = sections.html_page(diagnosis)
+    assert "Something is missing, and no name explains it well enough" in page
+    assert ("the nearest names are these" in page) == named and 'class="unresolved"' in page
+    assert "Nothing is missing" not in page
+
+
+def test_a_value_that_was_not_seen_is_said_so(diagnosis):
+    friction = diagnosis.summary["findings"][0]
+    friction["parameters"][0] |= {"value": None, "low": None, "high": None}
+    assert "not seen in these recordings" in sections.html_page(diagnosis)
