@@ -22,13 +22,14 @@ from diagnosis.trials.hiding import Usage
 from diagnosis.trials.laws import Gate
 from diagnosis.trials.oracle import visibility
 from diagnosis.trials.prediction import model_error, system_error
-from diagnosis.trials.robots import Robot, draw_robot, loguniform, to_mjcf
+from diagnosis.trials.robots import TOUCHES, Robot, draw_robot, loguniform, to_mjcf
 from diagnosis.trials.truth import TrueSystem
 
 KINDS = ("null", "single", "unknown", "pair", "many")
 SHARES = (0.25, 0.33, 0.2, 0.14, 0.08)
 ATTEMPTS = 30
 MOST_NOISE = 4e-3  # rad
+TOUCHED = 0.02  # share of the time that a contact or a stop has to act, where one can
 AGREEMENT = 0.5  # noise: most that the nominal integrator may be away from the true one
 
 
@@ -71,17 +72,21 @@ class Unfit(Exception):
 
 def draw_trial(key, settings):
     """The Trial of a key, a tuple of integers. Raises RuntimeError after too many unfit draws."""
-    kind = str(np.random.default_rng([*key, 0]).choice(KINDS, p=SHARES))
+    rng = np.random.default_rng([*key, 0])
+    kind = str(rng.choice(KINDS, p=SHARES))
+    touch = str(rng.choice(TOUCHES, p=settings.touches))
+    touch = touch if rng.random() < settings.touching else None
     for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([*key, 1, attempt])
         try:
-            return _attempt(np.random.default_rng([*key, 1, attempt]), kind, settings, attempt)
+            return _attempt(rng, kind, touch, settings, attempt)
         except Unfit:
             continue
     raise RuntimeError(f"trial {key}: no sane experiment in {ATTEMPTS} attempts")
 
 
-def _attempt(rng, kind, settings, attempt):
-    robot = draw_robot(rng, settings)
+def _attempt(rng, kind, touch, settings, attempt):
+    robot = draw_robot(rng, settings, touch)
     plan = draw_plan(rng, settings)
     usage = observe(robot, plan, rng)
     robot, plan = _agree(robot, plan, channel_noise(robot, plan.noise), rng)
@@ -176,7 +181,7 @@ def observe(robot, plan, rng):
     """Usage of a robot: one recording without anything hidden. Raises Unfit."""
     system = TrueSystem(robot)
     run = record(system, replace(plan, missing=0.0), rng, states=False)
-    if run is None:
+    if run is None or may_touch(robot) and run.touched < TOUCHED:
         raise Unfit
     data = mujoco.MjData(system.model)
     loads, mobility, torques = [], [], []
@@ -218,21 +223,25 @@ def observe(robot, plan, rng):
 def _agree(robot, plan, noise, rng):
     """(robot, plan) whose nominal integrator follows the true one to within AGREEMENT × the noise.
 
-    The nominal step is halved at most once; what is left is met by noisier sensors.
+    The nominal step is halved once, with contacts twice; what is left is met by noisier sensors.
     """
     run = record(TrueSystem(robot), replace(plan, seconds=1.5, missing=0.0), rng)
     if run is None:
         raise Unfit
-    for halving in range(2):
+    for halvings in range(3 if may_touch(robot) else 2):
+        robot = replace(robot, step=robot.step / 2) if halvings else robot
         error = integration_error(robot, run, noise)
         if error <= AGREEMENT:
             return robot, plan
-        if not halving:
-            robot = replace(robot, step=robot.step / 2)
     noisier = plan.noise * error / AGREEMENT
     if noisier > MOST_NOISE:
         raise Unfit
     return robot, replace(plan, noise=noisier)
+
+
+def may_touch(robot):
+    """Has a Robot feet on a ground, or joint ranges?"""
+    return robot.ground or any(link.range for link in robot.links)
 
 
 def integration_error(robot, run, noise):
@@ -256,7 +265,7 @@ def choose(rng, kind, robot, mimic=False):
     if len(offers) < count:
         raise Unfit
     effects = [str(e) for e in rng.choice(sorted(offers), count, replace=False)]
-    if sum(e in ("backlash", "joint_elasticity") for e in effects) > 1:
+    if any(sum(e in family for e in effects) > 1 for family in hiding.FAMILIES):
         raise Unfit
     if kind != "single" and "payload_change" in effects:  # it needs its moment
         raise Unfit
@@ -353,7 +362,7 @@ def _answer(trial, kind, plan, settings):
     sizes = {}
     for name in ("train", "held_out"):
         runs = getattr(trial, name)
-        runs = runs if trial.answer["gate"] == "one recording" else runs[:2]
+        runs = runs if trial.answer["gate"] == "one recording" else runs[:1]
         sizes[name] = []
         for index in range(len(trial.items)):
             system, kept = trial.without(index)
@@ -372,6 +381,7 @@ def _answer(trial, kind, plan, settings):
         "free_base": links[0].joint == "free",
         "contact": trial.true.ground,
         "stops": any(k.range for k in links),
+        "touched": round(float(np.mean([run.touched for run in trial.train])), 4),
         "passive": len(links) - len(trial.true.actuators) - (links[0].joint == "free"),
         "step": trial.nominal.step,
         "integrator": trial.nominal.integrator,

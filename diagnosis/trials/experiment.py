@@ -5,8 +5,10 @@ run = record(system, plan, seed)          # a Run: rows as a user has them, the 
 
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 
+SUNK = 2e-3  # m that a pose may start beneath the ground
 LEVELS = {"gentle": 0.2, "brisk": 0.6, "violent": 1.3}  # rad; slides move 0.15 m per rad
 
 
@@ -37,7 +39,7 @@ class Run:
     """One recording. time (T,), ctrl (T, nu), qpos (T, nq), qvel (T, nv; NaN where not measured).
 
     true_qpos, true_qvel: what noiseless sensors of the same machine read; states: snapshots of the
-    system per row; stamps: when the rows truly were.
+    system per row; stamps: when the rows truly were; touched: share of the time with a contact.
     """
 
     time: np.ndarray
@@ -49,6 +51,7 @@ class Run:
     stamps: np.ndarray
     states: list = field(repr=False)
     number: int = 0
+    touched: float = 0.0
 
 
 def channel_noise(robot, noise):
@@ -145,6 +148,7 @@ def record(system, plan, rng, number=0, states=True):
         stamps=stamps[keep],
         states=[s for s, k in zip(snaps, keep) if k],
         number=number,
+        touched=system.touched / max(system.steps, 1),
     )
 
 
@@ -170,7 +174,20 @@ def _start(system, references, rng, plan):
         if link.range:
             adr = system.address[index]
             qpos[adr] = np.clip(qpos[adr], 0.9 * link.range[0], 0.9 * link.range[1])
-    return qpos, qvel
+    return _above_ground(system, qpos), qvel
+
+
+def _above_ground(system, qpos):
+    """qpos (nq,), or a pose on the way from it to the upright one that sinks into no ground."""
+    if not system.robot.ground:
+        return qpos
+    for share in (1.0, 0.7, 0.4, 0.2, 0.0):
+        pose = system.model.qpos0 + share * (qpos - system.model.qpos0)
+        system.data.qpos[:] = pose
+        mujoco.mj_forward(system.model, system.data)
+        if not system.data.ncon or system.data.contact.dist.min() > -SUNK:
+            break
+    return pose
 
 
 def _control(system, k, goal, seen, trackers, plan):
@@ -204,8 +221,6 @@ class Sensor:
 
     def position(self, qpos):
         """qpos (nq,) as read."""
-        import mujoco
-
         if self.plan.noise_kind == "coloured":  # AR(1) with a memory of ten rows
             fresh = self.rng.normal(size=len(self.sigma))
             self.drift = 0.9 * self.drift + np.sqrt(1 - 0.81) * self.sigma * fresh
@@ -221,8 +236,6 @@ class Sensor:
 
     def speed(self, qvel, seen):
         """qvel (nv,) as recorded: NaN, truth with noise, or differences of positions filtered."""
-        import mujoco
-
         if self.plan.velocities == "none":
             return np.full(len(qvel), np.nan)
         if self.plan.velocities == "noisy":

@@ -168,6 +168,13 @@ MIMICS = (
     ("load_friction", "gain"),
     ("sensor_bias", "stiffness"),
 )
+AIR = 1.2  # kg/m^3
+FAMILIES = (  # of which a robot hides one: two would be one law with other values
+    ("backlash", "joint_elasticity"),
+    ("coulomb_friction", "stribeck_friction", "presliding", "friction_map"),
+    ("mass", "inertia"),
+    ("wind", "air_drag"),
+)
 OF_WORLD = ("gravity", "wind", "air_drag")
 WRONG_AXIS = "wrong_axis"
 UNNAMED = (*(law.__name__ for law in L.UNNAMED), WRONG_AXIS)
@@ -230,6 +237,8 @@ def hide(effect, spot, size, removed, nominal, true, usage, rng):
             needs=tuple(needs),
         )
         return nominal, true, [law], item
+    if effect == "wind":  # of air that the nominal model has as well, and holds still
+        nominal, true = replace(nominal, density=AIR), replace(true, density=AIR)
     law, place, parameters = _named_law(effect, spot, size, true, usage, rng)
     return nominal, true, [law], Item(effect, place, parameters)
 
@@ -482,7 +491,7 @@ def _surrounding(effect, spot, size, robot, usage, rng):
         density = 30.0 * size
         law = L.Air(0, density=density, x=0.0, y=0.0, z=0.0)
         return law, world, {"density": density}
-    wind = dict(zip("xyz", (12.0 * np.sqrt(size) * turn).tolist()))
+    wind = dict(zip("xyz", (40.0 * np.sqrt(size) * turn).tolist()))
     return L.Air(0, density=robot.density, **wind), world, wind
 
 

@@ -52,8 +52,8 @@ def recorded_addresses(nominal, model):
     for index in range(nominal.njnt):
         own = nominal.joint(index)
         joint = model.joint(own.name)
-        wide = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
-        q, v = wide.get(nominal.jnt_type[index], (1, 1))
+        wide = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}
+        q, v = wide.get(int(nominal.jnt_type[index]), (1, 1))
         qpos += range(joint.qposadr[0], joint.qposadr[0] + q)
         dof += range(joint.dofadr[0], joint.dofadr[0] + v)
     return np.array(qpos), np.array(dof)

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+TOUCHES = ("ground", "free base", "stops")
+TOUCHING_STEP = 0.002  # s, at most, where contacts are to be resolved
 REFINEMENT = 10  # substeps of the truth in one nominal step
 
 
@@ -107,9 +109,8 @@ class Settings:
     name: str
     joints: tuple = (1, 4)
     slides: float = 0.2
-    free_bases: float = 0.0
-    contacts: float = 0.0  # share of robots that meet the ground
-    stops: float = 0.2  # share of robots with joint ranges that are reached
+    touching: float = 0.5  # share of trials in which a contact or a stop acts
+    touches: tuple = (0.4, 0.3, 0.3)  # of these: feet of a fixed base, of a free one, joint ranges
     branching: float = 0.2  # chance that a link hangs at an earlier one than the last
     length: tuple = (0.10, 0.45)
     density: tuple = (400.0, 3000.0)
@@ -135,9 +136,8 @@ FINAL = Settings(
     name="final",
     joints=(1, 12),
     slides=0.25,
-    free_bases=0.12,
-    contacts=0.2,
-    stops=0.2,
+    touching=0.34,
+    touches=(0.35, 0.35, 0.3),
     branching=0.3,
     length=(0.06, 0.6),
     density=(250.0, 5000.0),
@@ -149,7 +149,7 @@ FINAL = Settings(
     high_gain=(10.0, 45.0),
     high_gains=0.5,
     tilted=0.5,
-    steps=(0.0005, 0.001, 0.002, 0.004),
+    steps=(0.001, 0.002, 0.004),
     row_seconds=(0.004, 0.008, 0.012, 0.02),
     noise=(5e-5, 2e-3),
     size_over_noise=(1.5, 100.0),
@@ -161,11 +161,15 @@ def loguniform(rng, low, high):
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def draw_robot(rng, settings):
-    """Draw one Robot. The tree first, its inertias and gains from its own mass matrix after."""
+def draw_robot(rng, settings, touch=None):
+    """Draw one Robot. The tree first, its inertias and gains from its own mass matrix after.
+
+    touch: one of TOUCHES, what the robot may touch; None for nothing.
+    """
     count = int(np.floor(loguniform(rng, settings.joints[0], settings.joints[1] + 0.999)))
-    free = bool(rng.random() < settings.free_bases and count > 2)
-    ground = free or bool(rng.random() < settings.contacts)
+    free = touch == "free base"
+    ground = touch in ("ground", "free base")
+    count = max(count, 2) if free else count
     links = []
     for index in range(count):
         links.append(_draw_link(rng, settings, links, free and index == 0))
@@ -173,10 +177,11 @@ def draw_robot(rng, settings):
         parents = {link.parent for link in links}
         links = [replace(k, foot=i not in parents) for i, k in enumerate(links)]
     step = float(rng.choice(settings.steps))
+    step = min(step, TOUCHING_STEP) if touch else step
     integrator = str(rng.choice(("Euler", "implicitfast", "RK4"), p=(0.4, 0.4, 0.2)))
     robot = Robot(tuple(links), (), step, step / REFINEMENT, integrator, ground=ground)
     robot = _lift(robot)
-    return _equip(rng, settings, robot)
+    return _equip(rng, settings, robot, touch == "stops")
 
 
 def _draw_link(rng, settings, links, free):
@@ -269,12 +274,11 @@ def joint_scales(robot, rng, draws=24):
     return pick(inertia), pick(load)
 
 
-def _equip(rng, settings, robot):
+def _equip(rng, settings, robot, stopped):
     """Rotors, damping, friction, springs, ranges and drives, scaled by what each joint moves."""
     inertia, load = joint_scales(robot, rng)
     digits = lambda value: float(f"{value:.4g}")
     actuators = []
-    stopped = rng.random() < settings.stops
     fast = rng.random() < settings.high_gains
     for index, link in enumerate(robot.links):
         if link.joint == "free":

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.trials import laws as law_module
-from diagnosis.trials.laws import Transmission
+from diagnosis.trials.laws import Air, Transmission
 from diagnosis.trials.robots import to_mjcf
 
 
@@ -29,6 +29,8 @@ class TrueSystem:
 
     def __init__(self, robot, laws=(), run=0):
         self.robot, self.laws, self.run = robot, list(laws), run
+        still = not any(isinstance(_inner(law), Air) for law in self.laws)
+        self._air = Air(0, density=robot.density, x=0.0, y=0.0, z=0.0) if still else None
         bare = replace(
             robot,
             links=tuple(
@@ -74,19 +76,22 @@ class TrueSystem:
         self._dofs = self.dof[self.jointed]
         self._smooth_before = None
         self.u = np.zeros(len(actuators))
+        self.steps = self.touched = 0  # substeps since `reset`, and those with a contact or a stop
         self.time, self.dt = 0.0, robot.substep
         hooked = lambda name: [k for k in self.laws if _has(k, name)]
         self.hooks = {
             name: hooked(name)
             for name in ("control", "drive", "force", "friction", "bodies", "couple", "measure")
         }
+        if self._air is not None and robot.density > 0:  # of the nominal model, without a wind
+            self.hooks["bodies"].append(self._air)
         self._rubs = bool(self.dry.any() or self.hooks["friction"])
 
     def reset(self, qpos, qvel):
         """Start a recording at time 0 from positions (nq,) and speeds (nv,), memories empty."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:], self.data.qvel[:] = qpos, qvel
-        self.time = 0.0
+        self.time, self.steps, self.touched = 0.0, 0, 0
         self._look()
         for law in self.laws:
             law.reset(self)
@@ -126,8 +131,11 @@ class TrueSystem:
             rate = self._couple(rate)
         if self._rubs:
             rate = self._rub(rate)
+        self.steps += 1
         if data.nefc:  # contacts and stops, with the friction in place
+            self.touched += 1
             data.qacc_smooth[:] = rate
+            mujoco.mj_mulM(model, data, data.qfrc_smooth, rate)  # the solver reads both
             mujoco.mj_fwdConstraint(model, data)
             rate = data.qacc
         after = data.qvel + self.dt * rate
@@ -243,10 +251,14 @@ class TrueSystem:
         return qpos, qvel
 
 
+def _inner(law):
+    """The law behind a gate, or the law itself."""
+    return getattr(law, "law", law)
+
+
 def _has(law, name):
     """Does a law, or the one behind its gate, define this hook?"""
-    inner = getattr(law, "law", law)
-    return getattr(type(inner), name) is not getattr(law_module.Law, name)
+    return getattr(type(_inner(law)), name) is not getattr(law_module.Law, name)
 
 
 def dry_friction(mobility, goal, limit, sweeps=20):
@@ -256,14 +268,20 @@ def dry_friction(mobility, goal, limit, sweeps=20):
     goal (n,): acceleration that would carry the speed through the substep without friction, plus
     speed over its length. mobility (n, n): inverse inertia.
     """
-    push = np.clip(-goal / np.diag(mobility), -limit, limit)
-    if len(push) == 1:
-        return push
+    if len(goal) == 1:
+        return np.clip(-goal / mobility[0], -limit, limit)
+    rows, goal, limit = mobility.tolist(), goal.tolist(), limit.tolist()
+    count = range(len(goal))
+    push = [min(max(-goal[i] / rows[i][i], -limit[i]), limit[i]) for i in count]
+    enough = 1e-6 * max(limit)
     for _ in range(sweeps):
-        before = push.copy()
-        for i in range(len(push)):
-            left = goal[i] + mobility[i] @ push
-            push[i] = min(max(push[i] - left / mobility[i, i], -limit[i]), limit[i])
-        if np.abs(push - before).max() <= 1e-6 * limit.max():
+        moved = 0.0
+        for i in count:
+            row = rows[i]
+            left = goal[i] + sum(row[k] * push[k] for k in count)
+            value = min(max(push[i] - left / row[i], -limit[i]), limit[i])
+            moved = max(moved, abs(value - push[i]))
+            push[i] = value
+        if moved <= enough:
             break
-    return push
+    return np.array(push)

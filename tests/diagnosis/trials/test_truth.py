@@ -155,11 +155,11 @@ def test_coupled_inertia_is_mujocos_tendon_armature():
     compare(robot, [L.CoupledInertia(1, other=0, inertia=0.05)], text, 2e-4)
 
 
-def compare(robot, laws, text, tolerance):
+def compare(robot, laws, text, tolerance, start=None):
     """The true system against stock MuJoCo's RK4 at fine steps, over half a second."""
     model = mujoco.MjModel.from_xml_string(text)
     data, system = mujoco.MjData(model), TrueSystem(robot, laws)
-    start = model.qpos0 + 0.2 * np.arange(1, model.nq + 1)
+    start = model.qpos0 + 0.2 * np.arange(1, model.nq + 1) if start is None else np.array([start])
     system.reset(start, np.zeros(model.nv))
     data.qpos[:] = start
     for row in range(50):
@@ -179,6 +179,25 @@ def test_drawn_robots_agree_with_stock_mujoco_where_nothing_is_hidden(seed):
     links = (replace(k, frictionloss=0.0, range=None) for k in robot.links)
     robot = replace(robot, links=tuple(links))
     compare(robot, [], to_mjcf(replace(robot, step=1e-4, integrator="RK4")), 1e-3)
+
+
+def test_still_air_of_the_nominal_model_is_mujocos():
+    robot = draw_robot(np.random.default_rng(3), replace(DEVELOPMENT, joints=(2, 3)))
+    links = (replace(k, frictionloss=0.0) for k in robot.links)
+    robot = replace(robot, links=tuple(links), density=300.0)
+    compare(robot, [], to_mjcf(replace(robot, step=1e-4, integrator="RK4")), 1e-3)
+
+
+def test_dry_friction_goes_on_where_a_stop_pushes():
+    robot = pendulum(frictionloss=0.5, range=(-0.3, 0.3), damping=0.3)
+    compare(robot, [], to_mjcf(replace(robot, step=1e-5)), 2e-3, start=0.25)
+
+
+def test_coupled_joints_with_friction_agree_with_mujoco_on_the_ground():
+    drawn = (draw_robot(np.random.default_rng(k), DEVELOPMENT, "ground") for k in range(100))
+    robot = next(r for r in drawn if len(r.links) == 2 and r.links[1].frictionloss > 0)
+    fine = to_mjcf(replace(robot, step=1e-5, integrator="implicitfast"))
+    compare(robot, [], fine, 2e-3)
 
 
 def test_a_snapshot_brings_back_everything():
