@@ -64,7 +64,7 @@ class ValueScore:
 class Score:
     """matches: one per hidden item; false: indices of findings that claim what is not there.
 
-    neutral: findings that are neither: time_step beside a right one, wrong nominal values put right.
+    neutral: findings that are neither: a finer time_step, one claim where the data tell nothing.
     """
 
     matches: tuple
@@ -117,10 +117,11 @@ def score_findings(answer, findings, seen=None):
         taken.add(finding)
         matches.append(_match(index, item, finding, findings[finding]))
     rest = [k for k in range(len(findings)) if k not in taken]
-    neutral = [k for k in rest if taken and findings[k]["effect"] == "time_step"]
+    step = lambda finding: finding["effect"] == "time_step" and (taken or _finer(finding))
+    neutral = [k for k in rest if step(findings[k])]
     for index, item in enumerate(hidden):
         if not seen[index] and item["required"] and matches[index].finding is None:
-            here = (k for k in rest if k not in neutral and _beside(findings[k]["place"], item))
+            here = (k for k in rest if k not in neutral and beside(findings[k]["place"], item))
             neutral += list(here)[:1]
     false = [k for k in rest if k not in neutral]
     needed = tuple(k for k, item in enumerate(hidden) if seen[k] and item["required"])
@@ -166,7 +167,14 @@ def same_place(place, other):
     return alike and parts(place) == parts(other)
 
 
-def _beside(place, item):
+def _finer(finding):
+    """Does a time_step say that the simulator's is too coarse? In every trial it is, a little."""
+    steps = finding.get("parameters") or [{}]
+    value, nominal = steps[0].get("value"), steps[0].get("nominal")
+    return value is not None and nominal is not None and value < nominal
+
+
+def beside(place, item):
     """Is a finding's place the item's own joint, link or drive (one number), or one of them the world?"""
     numbers = lambda p: set(re.findall(r"\d+", str(p["name"])))
     here, there = numbers(place), numbers(item["place"])

@@ -62,6 +62,13 @@ def test_time_step_beside_a_right_finding_is_neutral():
     assert got.strict and got.neutral == (0,)
 
 
+def test_a_finer_time_step_is_true_of_every_trial():
+    finer = finding("time_step", "world", "world", timestep=(-0.1, -0.2, 0.0))  # below nominal
+    assert score([], [finer]).strict
+    got = score([hidden()], [finer, finding(name="joint3")])
+    assert got.neutral == (0,) and got.false == (1,)
+
+
 def test_time_step_beside_a_wrong_finding_is_false():
     got = score([hidden()], [finding("time_step", "world", "world"), finding(name="joint3")])
     assert got.false == (0, 1)
