@@ -1,4 +1,5 @@
-"""Where does a simulator differ from recordings of the real system, which physics does it lack, and what is it with it?
+"""Where does a simulator differ from recordings of the real system, which physics does it lack, and
+what is it with it?
 
     python diagnose.py --model sim.xml --recordings real/*.csv [--held-out more/*.csv] --out report/
     python diagnose.py --env Hopper-v4 --recordings runs/*.npz --out report/
@@ -6,9 +7,9 @@
     diagnosis = diagnose("sim.xml", ["run1.csv", "run2.csv"])
     diagnosis.summary["findings"]
 
-Writes report.html (to look at), diagnosis.json (to compute with) and corrected.xml (to simulate with). Exit status: 0 a
-diagnosis was made, whatever it says; 2 bad input or not enough data, 1 a fault of this program, 130 stopped by Ctrl-C, with one
-line on stderr.
+Writes report.html (to look at), diagnosis.json (to compute with) and corrected.xml (to simulate
+with). Exit status: 0 a diagnosis was made, whatever it says; 2 bad input or not enough data, 1 a
+fault of this program, 130 stopped by Ctrl-C, with one line on stderr.
 """
 
 import argparse
@@ -22,33 +23,56 @@ import mujoco
 import numpy as np
 from tqdm import tqdm
 
+from diagnosis.common.atomic_files import WriteError, write_whole
 from diagnosis.common.mujoco_warnings import quiet
 from diagnosis.estimator import identify
+from diagnosis.nominal.model import ModelError, gains_of, load_world, together, with_gains
+from diagnosis.nominal.urdf import is_urdf, with_dynamics
 from diagnosis.recordings import plausibility
 from diagnosis.recordings import recording as recorded
 from diagnosis.recordings.cleaning import without_defects
+from diagnosis.recordings.column_map import load_layout
+from diagnosis.recordings.layout import Layout
 from diagnosis.report import text as wording
 from diagnosis.report import writer
-from diagnosis.simulation.simulator import World
+
+REFUSED = (  # what the user can mend
+    recorded.RecordingError,
+    ModelError,
+    writer.ReportError,
+    WriteError,
+    mujoco.FatalError,
+    MemoryError,
+)
 
 
-class ModelError(ValueError):
-    """The simulator cannot be used. One line: which, why, and what to do."""
-
-    def __init__(self, message):
-        super().__init__(" ".join(str(message).split()))
-
-
-def diagnose(model, recordings, held_out=None, progress=None):
+def diagnose(
+    model,
+    recordings,
+    held_out=None,
+    progress=None,
+    *,
+    columns=None,
+    degrees=False,
+    kp=None,
+    kd=None,
+    skip_meshes=False,
+):
     """Compare a simulator with recordings of the real system and return a Diagnosis.
 
-    model: MJCF path, gymnasium MuJoCo id, or mujoco.MjSpec. recordings: paths, or Recording objects. held_out: the same,
-    never used for fitting; None keeps back every third recording, or the last 30 % of each where there are fewer than
-    three. progress: called with (fraction done, what is being done).
-    Raises RecordingError, ModelError (both ValueError, one line).
+    model: MJCF or URDF path, gymnasium MuJoCo id, or mujoco.MjSpec. recordings: paths, or Recording
+    objects. held_out: the same, never used for fitting; None keeps back every third recording, or
+    the last 30 % of each where there are fewer than three. progress: called with (fraction done,
+    what is being done). columns: path of a column map (TOML). degrees: angles in the files are. kp,
+    kd: gains of the position controllers whose targets the controls of motors are, one number or
+    {joint: number}. skip_meshes: go on without meshes of a URDF that are not found. Raises
+    RecordingError, ModelError (both ValueError, one line).
     """
-    world = _world(model)
-    train, held = _recordings(recordings, held_out, world.model)
+    world = load_world(model, skip_meshes)
+    gains = gains_of({"kp": kp, "kd": kd}, world.model)
+    layout = load_layout(columns, degrees, frozenset(gains))
+    train, held = _recordings(recordings, held_out, world.model, layout)
+    world = with_gains(world, together(gains, train + held))
     given, notes = without_defects(train + held, world.model)
     train, held = given[: len(train)], given[len(train) :]
     notes += plausibility.check(given, world.model)
@@ -57,15 +81,16 @@ def diagnose(model, recordings, held_out=None, progress=None):
         train, held = split(train)
     plausibility.enough(train)
     diagnosis = identify(world, train, held, progress=progress)
-    return dataclasses.replace(
-        diagnosis, summary={**diagnosis.summary, "warnings": notes + diagnosis.summary["warnings"]}
-    )
+    warnings = notes + diagnosis.summary["warnings"]
+    return dataclasses.replace(diagnosis, summary={**diagnosis.summary, "warnings": warnings})
 
 
 def split(recordings):
-    """(for fitting, held out): every third recording is kept back, or the last 30 % of each of one or two.
+    """(for fitting, held out): every third recording is kept back, or the last 30 % of each of one
+    or two.
 
-    Such a last part keeps the rows before its `start`: actuator states and delayed controls run on from them.
+    Such a last part keeps the rows before its `start`: actuator states and delayed controls run on
+    from them.
     """
     if len(recordings) >= 3:
         return [r for i, r in enumerate(recordings) if i % 3 != 2], [
@@ -76,7 +101,8 @@ def split(recordings):
         cut = int(np.searchsorted(recording.time, recording.time[0] + 0.7 * np.ptp(recording.time)))
         if min(cut, len(recording.time) - cut) < 10:
             raise recorded.RecordingError(
-                f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} rows; record again, longer "
+                f"{recording.name}: not enough data to hold 30 % back: {len(recording.time)} "
+                f"rows; record again, longer "
                 f"({plausibility.ENOUGH}), or give --held-out"
             )
         early = dataclasses.replace(
@@ -92,41 +118,7 @@ def split(recordings):
     return parts[::2], parts[1::2]
 
 
-def _world(model):
-    """The nominal simulator of an MJCF path, a gymnasium id, or an MjSpec."""
-    if isinstance(model, mujoco.MjSpec):
-        what, make = "the given MjSpec", World
-    elif os.path.isfile(model := os.fspath(model)) or model.endswith(".xml"):
-        what, make = model, World.load
-        if not os.path.isfile(model):
-            raise ModelError(f"{model}: no such model file; check the path")
-    else:
-        what, make = model, World.from_env
-    try:
-        world = make(model)
-    except (
-        ValueError,
-        OSError,
-        TypeError,
-        AttributeError,
-        ImportError,
-        mujoco.FatalError,
-    ) as error:
-        do = (
-            "correct the file"
-            if make is World.load
-            else "give the id of a gymnasium MuJoCo environment, or --model file.xml"
-        )
-        raise ModelError(f"{what}: the model does not load ({error}); {do}") from None
-    if world.model.nq == 0:
-        raise ModelError(
-            f"{what}: the model has no joints, so nothing in it can move; give the model of the recorded "
-            "mechanism"
-        )
-    return world
-
-
-def _recordings(recordings, held_out, model):
+def _recordings(recordings, held_out, model, layout=Layout()):
     """Both lists as Recording objects, with names that tell them apart, and none in both."""
     one = (str, os.PathLike, recorded.Recording)
     given, more = ([x] if isinstance(x, one) else list(x or []) for x in (recordings, held_out))
@@ -142,7 +134,8 @@ def _recordings(recordings, held_out, model):
                 f"{path}: given both for fitting and as held out; give it once"
             )
     train, held = (
-        _apart(_loaded(some, paths, model)) for some, paths in ((given, files), (more, further))
+        _apart(_loaded(some, paths, model, layout))
+        for some, paths in ((given, files), (more, further))
     )
     taken = {recording.name for recording in train}
     return train, [
@@ -159,15 +152,15 @@ def _apart(recordings):
     return [dataclasses.replace(r, name=name) for r, name in zip(recordings, names)]
 
 
-def _loaded(given, paths, model):
+def _loaded(given, paths, model, layout):
     """What was given as Recording objects, from files what was given as paths: those first."""
-    read = recorded.load(paths, model) if paths else []
+    read = recorded.load(paths, model, layout) if paths else []
     return read + [recorded.accepted(x, model) for x in given if isinstance(x, recorded.Recording)]
 
 
 def _runs(model, recordings):
-    """Run the nominal model for 0.3 s from states of the recordings; notes on where it fails. Raises ModelError where it
-    fails in most."""
+    """Run the nominal model for 0.3 s from states of the recordings; notes on where it fails.
+    Raises ModelError where it fails in most."""
     data = mujoco.MjData(model)
     failed, tried, example = 0, 0, ""
     for recording in recordings[:10]:
@@ -197,12 +190,14 @@ def _runs(model, recordings):
             tried += 1
     if failed > tried / 2:
         raise ModelError(
-            f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first {example}); reduce its "
+            f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first "
+            f"{example}); reduce its "
             "time step, or check its masses and gains, and the units of the recordings"
         )
     return (
         [
-            f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first {example})"
+            f"the model blows up within 0.3 s of {failed} of {tried} recorded states (first "
+            f"{example})"
         ]
         if failed
         else []
@@ -214,34 +209,98 @@ class _Parser(argparse.ArgumentParser):
         raise ModelError(f"{message}; see --help")
 
 
-def main(argv=None):
-    """The command. Returns the exit status: 0, or 2 (its input), 1 (a fault of this program) or 130 (Ctrl-C) with one line on stderr."""
+def _parser():
+    """The command line."""
     parser = _Parser(
         prog="diagnose.py",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     nominal = parser.add_mutually_exclusive_group(required=True)
-    nominal.add_argument("--model", help="MJCF file of the nominal simulator")
+    nominal.add_argument("--model", help="MJCF or URDF file of the nominal simulator")
     nominal.add_argument("--env", help="gymnasium id of a MuJoCo environment, instead of --model")
+    several = {"nargs": "+", "action": "extend", "metavar": "FILE"}
+    what = "to fit: CSV, NPZ, ROS 2 bags, LeRobot or Minari datasets, PACE dictionaries"
+    parser.add_argument("--recordings", required=True, help=f"recordings {what}", **several)
+    parser.add_argument("--held-out", help="recordings only predicted, never fitted", **several)
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the report goes")
+    parser.add_argument("--map", metavar="TOML", help="what the files' columns are")
+    parser.add_argument("--degrees", action="store_true", help="angles in the files are in degrees")
+    gain = {"nargs": "+", "metavar": "GAIN", "help": "one number, or joint=number for each"}
     parser.add_argument(
-        "--recordings",
-        nargs="+",
-        action="extend",
-        required=True,
-        metavar="FILE",
-        help="CSV, NPZ or Minari recordings to fit",
+        "--kp", **{**gain, "help": f"controls are position targets: {gain['help']}"}
+    )
+    parser.add_argument("--kd", **gain)
+    parser.add_argument(
+        "--skip-meshes", action="store_true", help="go on without a URDF's missing meshes"
     )
     parser.add_argument(
-        "--held-out",
-        nargs="+",
-        action="extend",
-        metavar="FILE",
-        help="recordings that are only predicted, never fitted",
+        "--write-urdf", action="store_true", help="corrected.urdf too, with its <dynamics>"
     )
-    parser.add_argument(
-        "--out", required=True, metavar="FOLDER", help="where the report is written"
+    return parser
+
+
+def gain_words(option, words):
+    """None, a number, or {joint: number} of the words after --kp or --kd. Raises ModelError."""
+    if not words:
+        return None
+    pairs = [word.rpartition("=") for word in words]
+    try:
+        numbers = [float(number) for *_, number in pairs]
+    except ValueError:
+        numbers = [float("nan")]
+    named = [joint for joint, mark, _ in pairs if mark]
+    if (
+        not np.isfinite(numbers).all()
+        or len(named) not in (0, len(words))
+        or not named
+        and words[1:]
+    ):
+        raise ModelError(
+            f"{option} {' '.join(words)}: give one number, or joint=number for each joint"
+        )
+    return dict(zip(named, numbers)) if named else numbers[0]
+
+
+def _diagnosed(args, progress):
+    """Diagnose as the command line says, and write the report. Returns (diagnosis, files)."""
+    model = args.model
+    if model is not None and not os.path.isfile(model):
+        raise ModelError(f"{model}: no such model file; check the path")
+    if args.write_urdf and not (model and is_urdf(model)):
+        raise ModelError("--write-urdf: the model is no URDF; leave it out")
+    writer.check_folder(args.out)
+    diagnosis = diagnose(
+        model or args.env,
+        _expanded(args.recordings),
+        _expanded(args.held_out),
+        progress,
+        columns=args.map,
+        degrees=args.degrees,
+        kp=gain_words("--kp", args.kp),
+        kd=gain_words("--kd", args.kd),
+        skip_meshes=args.skip_meshes,
     )
+    files = writer.write(diagnosis, args.out)
+    if args.write_urdf:
+        text = with_dynamics(model, diagnosis.corrected_xml, _without_place(diagnosis.summary))
+        write_whole(os.path.join(args.out, "corrected.urdf"), text)
+        files = [*files, "corrected.urdf"]
+    return diagnosis, files
+
+
+def _without_place(summary):
+    """The findings that <dynamics> of a URDF has no place for, in words."""
+    return tuple(
+        f"{finding['effect']} at {finding['place']['kind']} {finding['place']['name']}"
+        for finding in summary["findings"]
+        if finding["effect"] not in ("viscous_damping", "coulomb_friction")
+    )
+
+
+def main(argv=None):
+    """The command. Returns the exit status: 0, or 2 (its input), 1 (a fault of this program) or 130
+    (Ctrl-C) with one line on stderr."""
     bar = None
 
     def progress(fraction, what):
@@ -249,54 +308,49 @@ def main(argv=None):
         bar.update(max(0, min(1, fraction) - bar.n))
 
     try:
-        args = parser.parse_args(argv)
-        if args.model is not None and not os.path.isfile(args.model):
-            raise ModelError(f"{args.model}: no such model file; check the path")
-        writer.check_folder(args.out)
+        args = _parser().parse_args(argv)
         with quiet():
             if sys.stderr.isatty():
                 bar = tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", file=sys.stderr)
-            given, held_out = _expanded(args.recordings), _expanded(args.held_out)
-            diagnosis = diagnose(args.model or args.env, given, held_out, bar and progress)
-            files = writer.write(diagnosis, args.out)
-    except (
-        recorded.RecordingError,
-        ModelError,
-        writer.ReportError,
-        mujoco.FatalError,
-        MemoryError,
-    ) as error:
-        if bar:
-            bar.close()
+            diagnosis, files = _diagnosed(args, bar and progress)
+    except REFUSED as error:
         message = " ".join(str(error).split()) or "out of memory; give fewer or shorter recordings"
-        print(f"diagnose.py: {message}", file=sys.stderr)
-        return 2
+        return _stopped(bar, 2, f"diagnose.py: {message}")
     except KeyboardInterrupt:
-        print("\ndiagnose.py: stopped; nothing was written", file=sys.stderr)
-        return 130
-    except Exception as error:  # a fault of the program: still no traceback at a user, but the place for who mends it
-        if bar:
-            bar.close()
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        print(
-            f"diagnose.py: a fault of this program, not of its input: {type(error).__name__} in "
-            f"{os.path.basename(place.filename)}, line {place.lineno} ({' '.join(str(error).split())}); please report this line, "
-            "with the model and recordings if they may be shown",
-            file=sys.stderr,
-        )
-        return 1
+        return _stopped(bar, 130, "\ndiagnose.py: stopped; nothing was written")
+    except Exception as error:
+        return _stopped(bar, 1, _fault(error))
     if bar:
         bar.close()
-    if hasattr(
-        sys.stdout, "reconfigure"
-    ):  # a terminal that cannot show ± or ∞ still shows the rest
+    if hasattr(sys.stdout, "reconfigure"):
+        # a terminal that cannot show ± or ∞ still shows the rest
         sys.stdout.reconfigure(errors="replace")
     print(wording.terminal(diagnosis.summary, args.out.rstrip("/"), files))
     return 0
 
 
+def _stopped(bar, status, line):
+    """The exit status, with its line on stderr."""
+    if bar:
+        bar.close()
+    print(line, file=sys.stderr)
+    return status
+
+
+def _fault(error):
+    """A fault of the program in a line: no traceback at a user, but the place for who mends it."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return (
+        f"diagnose.py: a fault of this program, not of its input: {type(error).__name__} in "
+        f"{os.path.basename(place.filename)}, line {place.lineno} "
+        f"({' '.join(str(error).split())}); please report this line, with the model and recordings "
+        "if they may be shown"
+    )
+
+
 def _expanded(paths):
-    """Patterns that the shell left as they are (Windows' does, and quotes do), replaced by the files they match."""
+    """Patterns that the shell left as they are (Windows' does, and quotes do), replaced by the
+    files they match."""
     found = (
         [pattern] if os.path.exists(pattern) else sorted(glob.glob(pattern)) or [pattern]
         for pattern in paths or []

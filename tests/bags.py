@@ -18,7 +18,8 @@ def joint_state(nanoseconds, names, position, velocity, effort):
 
 
 def write_bag(folder, topics, storage="sqlite3"):
-    """{topic: [(time of recording in ns, JointState, list of floats or str)]} into a bag at `folder`, a Path, returned."""
+    """{topic: [(time of recording in ns, JointState, list of floats or str)]} into a bag at
+    `folder`, a Path, returned."""
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer(folder, version=9, storage_plugin=plugin) as bag:
         for topic, messages in topics.items():

@@ -1,10 +1,12 @@
-"""Rows that only look measured: sensors that repeat their last value, drop out or spike. They become "not measured".
+"""Rows that only look measured: sensors that repeat their last value, drop out or spike. They
+become "not measured".
 
     recordings, notes = without_defects(recordings, model)
 
-A joint has inertia: it does not jump away and come back within three rows, nor stand still and catch up in one. What a
-coarse encoder does at slow speed (repeat, then move on by one count), what a joint at rest does and what an impact does
-(a new velocity, not a new position) stays. Velocities may jump, so in them only repeats count.
+A joint has inertia: it does not jump away and come back within three rows, nor stand still and
+catch up in one. What a coarse encoder does at slow speed (repeat, then move on by one count), what
+a joint at rest does and what an impact does (a new velocity, not a new position) stays. Velocities
+may jump, so in them only repeats count.
 """
 
 from dataclasses import replace
@@ -14,10 +16,8 @@ import numpy as np
 from diagnosis.recordings.columns import WIDTHS
 from diagnosis.recordings.plausibility import grouped
 
-AWAY, PACE = (
-    8,
-    3,
-)  # a spike is so many times as far off as rows usually are, and as the motion before and after goes in a row
+AWAY = 8  # a spike is so many times as far off as rows usually are,
+PACE = 3  # and as the motion before and after goes in a row
 LONGEST = 3  # rows of a spike; what lasts longer may be real
 CATCH_UP = 2  # the change after repeated values, in the one that follows it: above, they were stale
 LEAST = 3  # standard deviations of their number, by which repeats must outnumber those of chance
@@ -61,7 +61,8 @@ def _channels(model):
 
 
 def _spikes(values):
-    """(T,) rows, at most LONGEST at a time, in which values (T, k) are far from the line between the rows around them."""
+    """(T,) rows, at most LONGEST at a time, in which values (T, k) are far from the line between
+    the rows around them."""
     found = np.zeros(len(values), bool)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1))
     if len(rows) < 20:
@@ -70,11 +71,8 @@ def _spikes(values):
     change = np.abs(np.diff(x, axis=0)).max(axis=1)
     usual = np.quantile(_off_line(x, 1), 0.9)
     for n in range(1, LONGEST + 1):
-        off = _off_line(
-            x, n
-        )[
-            1:-1
-        ]  # off[i]: rows i + 2 to i + 1 + n, in motion at change[i] before and change[i + n + 2] after
+        # off[i]: rows i + 2 to i + 1 + n, with motion change[i] before and change[i + n + 2] after
+        off = _off_line(x, n)[1:-1]
         pace = np.max(
             [
                 change[: len(off)],
@@ -93,7 +91,8 @@ def _spikes(values):
 
 
 def _off_line(x, n):
-    """(T - n - 1,) how far at least n rows of x (T, k) are from the straight line between the row before and the one after."""
+    """(T - n - 1,) how far at least n rows of x (T, k) are from the straight line between the row
+    before and the one after."""
     first, last = x[: -n - 1], x[n + 1 :]
     inside = [
         np.abs(x[k : k + len(first)] - first - (last - first) * k / (n + 1)).max(axis=1)
@@ -103,8 +102,8 @@ def _off_line(x, n):
 
 
 def _repeats(values):
-    """(T,) rows in which values (T, k) are the row before's to the last digit, though the next new one, or the one before,
-    is far from it."""
+    """(T,) rows in which values (T, k) are the row before's to the last digit, though the next new
+    one, or the one before, is far from it."""
     found = np.zeros(len(values), bool)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1))
     if len(rows) < 20:

@@ -1,4 +1,5 @@
-"""Column maps: a TOML file that says what the columns of recordings are, so that nobody rewrites files.
+"""Column maps: a TOML file that says what the columns of recordings are, so that nobody rewrites
+files.
 
 [columns]                                   # the tool's name = the file's own
 time = {column = "stamp_us", scale = 1e-6}
@@ -24,7 +25,7 @@ TABLES = "columns", "joints", "ros"
 ROS = {"topic": str, "targets": str, "joints": list}
 
 
-def load_layout(path: str | None, degrees: bool = False, gains: bool = False) -> Layout:
+def load_layout(path: str | None, degrees: bool = False, gains: frozenset = frozenset()) -> Layout:
     """The Layout of a column map, or without one. Raises RecordingError."""
     if path is None:
         return Layout(degrees=degrees, gains=gains)
@@ -45,7 +46,8 @@ def load_layout(path: str | None, degrees: bool = False, gains: bool = False) ->
     tables = [content.get(name, {}) for name in TABLES]
     if not all(isinstance(table, dict) for table in tables) or not any(tables):
         raise RecordingError(
-            f"{path}: names nothing; write [columns], [joints] or [ros] and what stands for what below"
+            f"{path}: names nothing; write [columns], [joints] or [ros] and what stands for what "
+            f"below"
         )
     columns = {name: _source(path, name, value) for name, value in tables[0].items()}
     for joint, name in tables[1].items():
@@ -54,7 +56,8 @@ def load_layout(path: str | None, degrees: bool = False, gains: bool = False) ->
     for key, value in tables[2].items():
         if key not in ROS or not isinstance(value, ROS[key]):
             raise RecordingError(
-                f'{path}: [ros] {key!r}: write topic = "...", targets = "...", joints = ["...", ...]'
+                f'{path}: [ros] {key!r}: write topic = "...", targets = "...", joints = ["...", '
+                f"...]"
             )
     return Layout(path, columns, tables[1], tables[2], degrees, gains)
 
@@ -75,5 +78,6 @@ def _source(path, name, value):
         ):
             return Source(value["column"], rest.get("scale", 1.0), rest.get("offset", 0.0))
     raise RecordingError(
-        f'{path}: [columns] {name!r}: write "column", {{column = "...", scale = 1.0, offset = 0.0}}, or a number'
+        f'{path}: [columns] {name!r}: write "column", '
+        f'{{column = "...", scale = 1.0, offset = 0.0}}, or a number'
     )

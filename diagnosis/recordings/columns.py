@@ -1,7 +1,7 @@
 """Columns of a recording: what a model calls them.
 
-columns_of(model)                      # {"qpos:elbow": ("qpos", 3), ...}: every column of a recording of this model
-Names(model).canonical("qpos:1")       # "qpos:elbow"
+columns_of(model)                   # {"qpos:elbow": ("qpos", 3), ...}: every column there can be
+Names(model).canonical("qpos:1")    # "qpos:elbow"
 """
 
 import difflib
@@ -25,13 +25,15 @@ class RecordingError(ValueError):
         super().__init__(" ".join(str(message).split()))
 
 
-# --- what the model calls them ---------------------------------------------------------------------------------------
+# --- what the model calls them
 
 
 def columns_of(model: mujoco.MjModel) -> dict:
-    """Every column that a recording of this model can have: {"qpos:elbow": ("qpos", 3), ...}, in MuJoCo's order.
+    """Every column that a recording of this model can have: {"qpos:elbow": ("qpos", 3), ...}, in
+    MuJoCo's order.
 
-    The value is the kind and the index within qpos, qvel or ctrl; for sensors ("sensor:<name>", component).
+    The value is the kind and the index within qpos, qvel or ctrl; for sensors ("sensor:<name>",
+    component).
     """
     table = {}
 
@@ -66,7 +68,8 @@ def single_joints(model: mujoco.MjModel) -> list[str]:
 
 
 def _by_index(model):
-    """The same columns with every place by its index, for those who write qpos:0 although the joint has a name."""
+    """The same columns with every place by its index, for those who write qpos:0 although the joint
+    has a name."""
     table = {}
     for kind, count, named in (
         ("qpos", model.njnt, model.joint),
@@ -87,7 +90,8 @@ class Names:
         self.by_joint = {f"{kind}:{j}" for j in single_joints(model) for kind in BY_JOINT}
 
     def canonical(self, name: str) -> str | None:
-        """The model's name of a column called `name`, perhaps by an index; None: not one of this model's."""
+        """The model's name of a column called `name`, perhaps by an index; None: not one of this
+        model's."""
         if name == "time" or name in self.known or name in self.by_joint:
             return name
         head, _, component = name.rpartition(":")
@@ -122,15 +126,20 @@ class Names:
             return f"the model has no {what} {place!r}{meant}"
         return "not a column of a recording" + (
             meant
-            or "; columns are time, qpos:<joint>, qvel:<joint>, ctrl:<actuator>, sensor:<name> (or give --map)"
+            or "; columns are time, qpos:<joint>, qvel:<joint>, ctrl:<actuator>, sensor:<name> "
+            "(or give --map)"
         )
 
 
-# --- whole arrays ----------------------------------------------------------------------------------------------------
+# --- whole arrays
+#
+#
+#
 
 
 def by_column(path: str, arrays: Mapping[str, np.ndarray], model: mujoco.MjModel) -> dict:
-    """Whole arrays (time, qpos, qvel, ctrl, sensor:<name>) to {column name: (T,)}; raises RecordingError on widths."""
+    """Whole arrays (time, qpos, qvel, ctrl, sensor:<name>) to {column name: (T,)}; raises
+    RecordingError on widths."""
     names = Names(model)
     known = names.known
     widths = {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu}
@@ -141,13 +150,15 @@ def by_column(path: str, arrays: Mapping[str, np.ndarray], model: mujoco.MjModel
     for key in ("time", "qpos", *(["ctrl"] if model.nu else [])):
         if key not in arrays:
             raise RecordingError(
-                f"{path}: array {key!r} is missing; a recording has time (T,), qpos (T, {model.nq}), "
+                f"{path}: array {key!r} is missing; a recording has time (T,), qpos (T, "
+                f"{model.nq}), "
                 f"ctrl (T, {model.nu})"
             )
     for key, array in arrays.items():
         if array.dtype.kind not in "fiu":
             raise RecordingError(
-                f"{path}: array {key!r} holds {array.dtype} instead of real numbers; save it as float64"
+                f"{path}: array {key!r} holds {array.dtype} instead of real numbers; save it as "
+                f"float64"
             )
         if key not in widths and key != "time":
             raise RecordingError(f"{path}: array {key!r}: {names.unknown(key)}")

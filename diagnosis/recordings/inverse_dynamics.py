@@ -1,8 +1,11 @@
-"""What force is left over: inverse dynamics of smoothed recordings, under the nominal and under the corrected model.
+"""What force is left over: inverse dynamics of smoothed recordings, under the nominal and under the
+corrected model.
 
-    residual = M(q) a + c(q, v) - passive - friction and contact - actuators        (N or N·m per joint)
+    residual = M(q) a + c(q, v) - passive - friction and contact - actuators        (N or N·m per
+    joint)
 
-For pictures and for plausibility checks; the diagnosis itself never differentiates recordings twice.
+For pictures and for plausibility checks; the diagnosis itself never differentiates recordings
+twice.
 """
 
 import mujoco
@@ -14,8 +17,8 @@ HALF = 0.03  # s: half width of the parabolas that smooth the positions
 
 
 def smooth(model, recording, most, seconds=HALF):
-    """Local parabolas over ± `seconds` at up to `most` rows: time (n,), qpos (n, nq), qvel, qacc (n, nv), and the mean
-    control (n, nu) beside them. Rows near unmeasured ones are left out."""
+    """Local parabolas over ± `seconds` at up to `most` rows: time (n,), qpos (n, nq), qvel, qacc
+    (n, nv), and the mean control (n, nu) beside them. Rows near unmeasured ones are left out."""
     time, rows = recording.time, len(recording.time)
     half = max(3, int(round(seconds / np.median(np.diff(time)))))
     centres = (
@@ -56,7 +59,8 @@ def smooth(model, recording, most, seconds=HALF):
 
 
 def forces(model, qpos, qvel, qacc, ctrl):
-    """(n, nv) residual force of a model on smoothed states; its own actuator states are not known, so it has none."""
+    """(n, nv) residual force of a model on smoothed states; its own actuator states are not known,
+    so it has none."""
     data, out = mujoco.MjData(model), np.empty((len(qpos), model.nv))
     for row, (q, v, a, u) in enumerate(zip(qpos, qvel, qacc, ctrl)):
         data.qpos[:], data.qvel[:], data.ctrl[: len(u)] = q, v, u
@@ -69,8 +73,9 @@ def forces(model, qpos, qvel, qacc, ctrl):
 
 
 def residuals(diagnosis, most=1200):
-    """One dict per finding that can be drawn: finding (index), variable, x, before, after (n,), unit, x_unit, joint (name). after:
-    under corrected.xml; NaN for a finding that it cannot hold."""
+    """One dict per finding that can be drawn: finding (index), variable, x, before, after (n,),
+    unit, x_unit, joint (name). after: under corrected.xml; NaN for a finding that it cannot
+    hold."""
     nominal = diagnosis.world.model
     corrected = mujoco.MjModel.from_xml_string(diagnosis.corrected_xml)
     measured = [r.seen() for r in diagnosis.held_out if not np.isnan(r.qpos).all(axis=0).any()]
@@ -117,7 +122,8 @@ def residuals(diagnosis, most=1200):
 
 
 def _variable(model, variable, time, qpos, qvel, ctrl):
-    """(values (n,), joint id or None, unit) of "velocity:elbow", "control:motor", "time"; values None where unknown."""
+    """(values (n,), joint id or None, unit) of "velocity:elbow", "control:motor", "time"; values
+    None where unknown."""
     kind, _, name = variable.partition(":")
     if kind == "time":
         return time, None, "s"
@@ -139,7 +145,8 @@ def _variable(model, variable, time, qpos, qvel, ctrl):
 
 
 def _joint_of(model, place, joint):
-    """The joint whose force shows a finding: its own, its actuator's, or else the one it depends on."""
+    """The joint whose force shows a finding: its own, its actuator's, or else the one it depends
+    on."""
     if place["kind"] == "joint":
         own = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, place["name"])
         return own if own >= 0 else None

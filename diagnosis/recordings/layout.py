@@ -1,12 +1,12 @@
 """How a file's own columns become those of the model.
 
-plan = Layout().plan(path, header, natural, model)
-columns, gains = plan.apply(path, raw, model)
+    plan = Layout().plan(path, header, natural, model)
+    columns, gains = plan.apply(path, raw, model)
 
-Beside the model's own columns a file may name, joint by joint, `effort:<joint>` (torque or force at the joint),
-`target:<joint>` (where its position controller is told to go) and `kp:<joint>`, `kd:<joint>` (that controller's gains): the
-control of the actuator on that joint follows from them. Every fault raises RecordingError with one line: file, row,
-column, and what to do.
+Beside the model's own columns a file may name, joint by joint, `effort:<joint>` (torque or force at
+the joint), `target:<joint>` (where its position controller is told to go) and `kp:<joint>`,
+`kd:<joint>` (that controller's gains): the control of the actuator on that joint follows from them.
+Every fault raises RecordingError with one line: file, row, column, and what to do.
 """
 
 from collections.abc import Iterable, Mapping
@@ -22,7 +22,8 @@ HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
 class Source(NamedTuple):
-    """Where a column comes from: `offset + scale * file's column`; column None: `offset` in every row."""
+    """Where a column comes from: `offset + scale * file's column`; column None: `offset` in every
+    row."""
 
     column: str | None
     scale: float = 1.0
@@ -32,8 +33,10 @@ class Source(NamedTuple):
 class Raw(NamedTuple):
     """One run as its file has it.
 
-    label: for messages; name: of the recording; columns: {the file's own name: (T,) float64}; natural: {our name: the
-    file's own}, as its format implies; first_row: what the file's own reader calls the row of columns[...][0]; notes.
+    label: for messages; name: of the recording; columns: {the file's own name: (T,) float64};
+    natural: {our name: the
+    file's own}, as its format implies; first_row: what the file's own reader calls the row of
+    columns[...][0]; notes.
     """
 
     label: str
@@ -48,9 +51,10 @@ class Raw(NamedTuple):
 class Layout:
     """How the user says that files are to be read.
 
-    label: of the map's file, for messages; columns: {our name: Source}, ahead of what the format implies; joints: {model's
-    joint: its name in the files}; ros: topics of ROS 2 bags, {"topic", "targets", "joints"}; degrees: hinges' positions,
-    velocities and targets are in degrees; gains: the controls of motors are position targets (--kp).
+    label: of the map's file, for messages; columns: {our name: Source}, ahead of what the format
+    implies; joints: {model's joint: its name in the files}; ros: topics of ROS 2 bags, {"topic",
+    "targets", "joints"}; degrees: hinges' positions, velocities and targets are in degrees; gains:
+    the joints whose motors follow position targets (--kp).
     """
 
     label: str = ""
@@ -58,7 +62,7 @@ class Layout:
     joints: Mapping[str, str] = field(default_factory=dict)
     ros: Mapping[str, object] = field(default_factory=dict)
     degrees: bool = False
-    gains: bool = False
+    gains: frozenset[str] = frozenset()
 
     @property
     def mapped(self) -> bool:
@@ -90,7 +94,8 @@ class Layout:
                 raise RecordingError(f"{self.label}: {wish!r}: {names.unknown(wish)}")
             if source.column is not None and source.column not in header:
                 raise RecordingError(
-                    f"{path}: column {source.column!r}, which {self.label} names for {wish!r}, is not in "
+                    f"{path}: column {source.column!r}, which {self.label} names for {wish!r}, is "
+                    f"not in "
                     f"the file; it has {_few(header)}"
                 )
             sources[ours] = source
@@ -104,17 +109,20 @@ class Layout:
         return Plan(self, _with_controls(path, sources, header, model, self))
 
     def _check_joints(self, path, natural, model):
-        """Raises RecordingError where [joints] names one that the model or the file does not have."""
+        """Raises RecordingError where [joints] names one that the model or the file does not
+        have."""
         ours = {model.joint(j).name or str(j) for j in range(model.njnt)}
         theirs = {name.partition(":")[2] for name in natural if ":" in name}
         for joint, name in self.joints.items():
             if joint not in ours:
                 raise RecordingError(
-                    f"{self.label}: [joints] {joint!r}: the model has no such joint; it has {_few(sorted(ours))}"
+                    f"{self.label}: [joints] {joint!r}: the model has no such joint; it has "
+                    f"{_few(sorted(ours))}"
                 )
             if name not in theirs:
                 raise RecordingError(
-                    f"{path}: joint {name!r}, which {self.label} names for {joint!r}, is not in the file; it has "
+                    f"{path}: joint {name!r}, which {self.label} names for {joint!r}, is not in "
+                    f"the file; it has "
                     f"{_few(sorted(theirs))}"
                 )
 
@@ -126,11 +134,10 @@ def _few(names):
 
 
 def _with_controls(path, sources, header, model, layout):
-    """The sources with one for every control that follows from an effort or a target. Raises RecordingError on what is
-    missing."""
+    """The sources with one for every control that follows from an effort or a target. Raises
+    RecordingError on what is missing."""
     sources = dict(sources)
     _complete(path, sources, ("time", "qpos:"), header, model, layout)
-    gains = layout.gains or any(name.startswith(GAINS) for name in sources)
     known = columns_of(model)
     for a in range(model.nactuator):
         control = f"ctrl:{model.actuator(a).name or a}"
@@ -144,7 +151,7 @@ def _with_controls(path, sources, header, model, layout):
             continue
         gear = float(model.actuator_gear[a, 0])
         target, effort = sources.get(f"target:{joint}"), sources.get(f"effort:{joint}")
-        if target and (servo or gains):
+        if target and (servo or joint in layout.gains or f"kp:{joint}" in sources):
             factor = gear if servo else 1.0
             sources[control] = target._replace(
                 scale=target.scale * factor, offset=target.offset * factor
@@ -156,12 +163,14 @@ def _with_controls(path, sources, header, model, layout):
             )
         elif target:
             raise RecordingError(
-                f"{path}: 'target:{joint}' is a position and {model.actuator(a).name!r} a motor; give --kp and "
+                f"{path}: 'target:{joint}' is a position and {model.actuator(a).name!r} a motor; "
+                f"give --kp and "
                 "--kd, the gains of the controller that follows it"
             )
         elif effort:
             raise RecordingError(
-                f"{path}: 'effort:{joint}' is a torque and {model.actuator(a).name!r} a position servo; give "
+                f"{path}: 'effort:{joint}' is a torque and {model.actuator(a).name!r} a position "
+                f"servo; give "
                 "its targets, or a model with motors"
             )
     _complete(path, sources, "ctrl:", header, model, layout)
@@ -219,7 +228,8 @@ class Plan:
     sources: Mapping[str, Source]
 
     def apply(self, path: str, raw: Mapping[str, np.ndarray], model: mujoco.MjModel):
-        """({our column: (T,) float64, SI}, {joint: {"kp": ..., "kd": ...}}) from the file's own columns."""
+        """({our column: (T,) float64, SI}, {joint: {"kp": ..., "kd": ...}}) from the file's own
+        columns."""
         rows = len(next(iter(raw.values())))
         known, columns, gains = columns_of(model), {}, {}
         turning = self._turning(model) if self.layout.degrees else ()
@@ -249,16 +259,16 @@ class Plan:
         return ()
 
     def _turning(self, model):
-        """The columns that are angles or their rates: of hinges, and the controls that are targets of theirs."""
+        """The columns that are angles or their rates: of hinges, and the controls that are targets
+        of theirs."""
         hinges = {
             model.joint(j).name or str(j) for j in range(model.njnt) if model.jnt_type[j] == HINGE
         }
         out = {f"{kind}:{joint}" for joint in hinges for kind in ("qpos", "qvel")}
-        gains = self.layout.gains or any(name.startswith(GAINS) for name in self.sources)
         for a in range(model.nactuator):
-            if joint_of(model, a) in hinges and (
-                is_servo(model, a) or gains and is_motor(model, a)
-            ):
+            joint = joint_of(model, a)
+            followed = joint in self.layout.gains or f"kp:{joint}" in self.sources
+            if joint in hinges and (is_servo(model, a) or is_motor(model, a) and followed):
                 out.add(f"ctrl:{model.actuator(a).name or a}")
         return out
 
@@ -270,7 +280,9 @@ def _constant(path, name, values):
         raise RecordingError(f"{path}: column {name!r}: a gain has to be a number from 0 upwards")
     if np.ptp(values) > 1e-9 * np.abs(values).max():
         raise RecordingError(
-            f"{path}: column {name!r} changes from {values[0]:g} to {values[np.argmax(values != values[0])]:g}; one "
-            "run has one gain: put the parts into files of their own, and diagnose each gain by itself"
+            f"{path}: column {name!r} changes from {values[0]:g} to "
+            f"{values[np.argmax(values != values[0])]:g}; one "
+            "run has one gain: put the parts into files of their own, and diagnose each gain by "
+            "itself"
         )
     return float(values[0])

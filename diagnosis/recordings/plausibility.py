@@ -1,4 +1,5 @@
-"""Recordings that cannot be what they claim: refuse the evident mistakes, warn about what looks wrong.
+"""Recordings that cannot be what they claim: refuse the evident mistakes, warn about what looks
+wrong.
 
 for warning in check(recordings, model):
     print(warning)
@@ -15,15 +16,18 @@ from diagnosis.recordings.unit_check import suspect
 HIGH, FAST = (
     10,
     8.0,
-)  # order of differences that leave nothing of fast motion; noises, of which white noise spans 4.7 between the quantiles
+    # order of differences that leave nothing of fast motion; noises, of which white noise spans 4.7
+    # between the quantiles
+)
 ENOUGH = "10 s of varied motion sampled at 50 Hz or more is a good start"
 
 
 def check(recordings, model):
     """What looks wrong, one line each: for the user to read before believing a diagnosis.
 
-    Raises RecordingError where the evidence is beyond doubt (a time in ms, a joint in degrees, swapped columns, a gap,
-    nothing that moves) since a diagnosis would then describe the mistake and not the machine.
+    Raises RecordingError where the evidence is beyond doubt (a time in ms, a joint in degrees,
+    swapped columns, a gap, nothing that moves) since a diagnosis would then describe the mistake
+    and not the machine.
     """
     found = {}  # message -> [(recording's name, share of its rows)] of those it holds for
 
@@ -49,26 +53,30 @@ def check(recordings, model):
 
 
 def enough(recordings):
-    """The recordings in which something moves. Raises RecordingError where they are too little, or one is another's copy."""
+    """The recordings in which something moves. Raises RecordingError where they are too little, or
+    one is another's copy."""
     moving = [recording for recording in recordings if _moves(recording)]
     everything = recordings[0].name + _more(recordings)
     rows, seconds = sum(len(r.time) for r in moving), sum(r.time[-1] - r.time[0] for r in moving)
     _check_copies(moving)
     if not moving:
         raise RecordingError(
-            f"{everything}: not enough data: nothing moves beyond the sensors' noise; move every joint of "
+            f"{everything}: not enough data: nothing moves beyond the sensors' noise; move every "
+            f"joint of "
             f"interest ({ENOUGH})"
         )
     if rows < 20 or seconds < 0.6:
         raise RecordingError(
-            f"{everything}: not enough data: {rows} rows over {seconds:.2g} s; at least 20 rows over 0.6 s "
+            f"{everything}: not enough data: {rows} rows over {seconds:.2g} s; at least 20 rows "
+            f"over 0.6 s "
             f"are needed, and {ENOUGH}"
         )
     return moving
 
 
 def grouped(found):
-    """{message: [(recording's name, share of its rows), ...]} in lines, one for all recordings; "{}" becomes the share."""
+    """{message: [(recording's name, share of its rows), ...]} in lines, one for all recordings;
+    "{}" becomes the share."""
     return [
         f"{places[0][0]}{_more(places)}: {message.replace('{}', _share(places))}"
         for message, places in found.items()
@@ -90,7 +98,8 @@ def _share(places):
 
 
 def _check_copies(recordings):
-    """Raises RecordingError where two recordings are the same: one would be judged by its own copy."""
+    """Raises RecordingError where two recordings are the same: one would be judged by its own
+    copy."""
     known = {}
     for recording in recordings:
         content = recording.qpos.tobytes(), recording.ctrl.tobytes()
@@ -107,7 +116,8 @@ def _moves(recording):
 
 
 def _leaves_noise(values):
-    """Whether (T,) measured values leave the band of their own noise (five sigma, from second differences) for good."""
+    """Whether (T,) measured values leave the band of their own noise (five sigma, from second
+    differences) for good."""
     if len(values) < 5:
         return False
     by_differences = lambda order: (
@@ -136,149 +146,177 @@ def _check_time(recording, model, warn):
             if usual < 0.3 * unit[1] or unit[1] == 1e9
         )
         raise RecordingError(
-            f"{where}: rows stand {usual:g} s apart, too far to see any dynamics; if these are {unit}, "
+            f"{where}: rows stand {usual:g} s apart, too far to see any dynamics; if these are "
+            f"{unit}, "
             f"divide by {factor:g}"
         )
     if usual < 1e-6 or usual < model.opt.timestep / 500:
         raise RecordingError(
-            f"{where}: rows stand {usual:.3g} s apart against a time step of {model.opt.timestep:g} s; "
+            f"{where}: rows stand {usual:.3g} s apart against a time step of "
+            f"{model.opt.timestep:g} s; "
             "write seconds"
         )
     row = int(np.argmin(steps))
     if steps[row] < 1e-4 * usual:
         raise RecordingError(
-            f"{where}: the row at {recording.time[row + 1]:.12g} s stands {steps[row]:.3g} s after the one before (others "
+            f"{where}: the row at {recording.time[row + 1]:.12g} s stands {steps[row]:.3g} s "
+            f"after the one before (others "
             f"{usual:.3g} s); no velocity can be formed from these two, remove one"
         )
     row = int(np.argmax(steps))
     if steps[row] > max(20 * usual, 0.1):
         raise RecordingError(
             f"{where}: gap of {steps[row]:.3g} s after {recording.time[row]:.12g} s "
-            f"(rows are {usual:.3g} s apart); split the file there, or write the missing rows with nan "
+            f"(rows are {usual:.3g} s apart); split the file there, or write the missing rows "
+            f"with nan "
             "positions and their control"
         )
     if steps[row] > 5 * usual:
         warn(
             recording,
-            f"gap of {steps[row]:.3g} s after {recording.time[row]:.12g} s, rows are {usual:.3g} s apart",
+            f"gap of {steps[row]:.3g} s after {recording.time[row]:.12g} s, rows are {usual:.3g} "
+            f"s apart",
         )
 
 
 def _check_values(recording, model, warn):
-    """Channel by channel: constant, clipped, mostly missing, wrapped angles, far outside the model's ranges."""
-    rows = len(recording.time)
+    """Channel by channel: constant, clipped, mostly missing, wrapped, far outside the ranges."""
     for column, (kind, k) in columns_of(model).items():
         if kind not in ("qpos", "ctrl"):
             continue
         values = getattr(recording, kind)[:, k]
-        where = f"{recording.name}: column {column!r}"
         missing = np.isnan(values)
         if missing.any():
             what = (
-                "is not measured; it is guessed, and where it moves the others that will look like missing physics"
+                "is not measured; it is guessed, and where it moves the others that will look like "
+                "missing physics"
                 if missing.all()
                 else "has nan in {} of its rows"
             )
             warn(recording, f"{column} {what}", missing.mean())
-            values = values[~missing]
-        if len(values) < 2:
+        measured = values[~missing]
+        if len(measured) < 2:
             continue
-        low, high = values.min(), values.max()
-        if low == high:
+        if measured.min() == measured.max():
             warn(
                 recording,
-                f"{column} is constant at {low:g}; nothing can be said about what only it would show",
+                f"{column} is constant at {measured[0]:g}; nothing can be said about what only it "
+                "would show",
             )
             continue
+        channel = Channel(recording, column, kind, k, measured, recording.time[~missing], model)
+        if kind == "qpos":
+            _check_motion(channel, warn)
+        _check_range(channel, warn)
+        _check_edges(channel, warn)
+
+
+class Channel:
+    """One position or control of a recording, with what the model says of it.
+
+    values, time (N,): where it was measured; hinge: an angle; limited, span: its range.
+    """
+
+    def __init__(self, recording, column, kind, k, values, time, model):
+        self.recording, self.column, self.kind = recording, column, kind
+        self.values, self.time = values, time
+        self.where = f"{recording.name}: column {column!r}"
+        self.hinge = False
         if kind == "qpos":
             joint = int(np.searchsorted(model.jnt_qposadr, k, side="right")) - 1
             single = model.jnt_type[joint] not in WIDTHS
-            hinge = single and model.jnt_type[joint] == 3
-            limited, span = single and model.jnt_limited[joint], model.jnt_range[joint]
-            jumps, steps = np.abs(np.diff(values)), np.diff(recording.time[~missing])
-            row = int(
-                np.argmax(np.where(steps < 2 * np.median(steps), jumps, 0.0))
-            )  # who turns on while not measured jumps too
-            speed = np.percentile(jumps / steps, 90)
-            if speed > (3000 if hinge else 340):
-                raise RecordingError(
-                    f"{where}: moves at {speed:.3g} {'rad/s' if hinge else 'm/s'} most of the time; "
-                    f"is it in {'degrees' if hinge else 'mm'}? convert it to {'rad' if hinge else 'm'}, "
-                    "and time to s"
-                )
-            if not _leaves_noise(values):
-                warn(
-                    recording,
-                    f"{column} does not move beyond the sensor's noise; nothing can be said about what only its "
-                    "motion would show",
-                )
-            if (
-                hinge
-                and abs(jumps[row] - 2 * np.pi) < 0.5
-                and jumps[row] > 20 * np.median(jumps) + 1e-6
-            ):
-                raise RecordingError(
-                    f"{where}: jumps by {jumps[row]:.3g} rad after "
-                    f"{recording.time[~missing][row]:.12g} s, a wrapped angle; unwrap it (numpy.unwrap)"
-                )
+            self.hinge = single and model.jnt_type[joint] == 3
+            self.limited, self.span = single and model.jnt_limited[joint], model.jnt_range[joint]
         else:
-            limited, span = model.actuator_ctrllimited[k], model.actuator_ctrlrange[k]
-        largest = max(abs(low), abs(high))
-        if limited and largest > 10 * np.abs(span).max() > 0:
-            unit = "degrees" if kind == "qpos" and hinge else "another unit than the model's"
-            raise RecordingError(
-                f"{where}: reaches {largest:g} where the model's range is {span[0]:g} to {span[1]:g}; "
-                f"if it is in {unit}, convert it"
+            self.limited, self.span = model.actuator_ctrllimited[k], model.actuator_ctrlrange[k]
+
+
+def _check_motion(channel, warn):
+    """A position that moves too fast, not at all, or jumps by a turn."""
+    values, hinge = channel.values, channel.hinge
+    jumps, steps = np.abs(np.diff(values)), np.diff(channel.time)
+    # who turns on while not measured jumps too
+    row = int(np.argmax(np.where(steps < 2 * np.median(steps), jumps, 0.0)))
+    speed = np.percentile(jumps / steps, 90)
+    if speed > (3000 if hinge else 340):
+        raise RecordingError(
+            f"{channel.where}: moves at {speed:.3g} {'rad/s' if hinge else 'm/s'} most of the "
+            f"time; is it in {'degrees' if hinge else 'mm'}? convert it to "
+            f"{'rad' if hinge else 'm'}, and time to s"
+        )
+    if not _leaves_noise(values):
+        warn(
+            channel.recording,
+            f"{channel.column} does not move beyond the sensor's noise; nothing can be said about "
+            "what only its motion would show",
+        )
+    if hinge and abs(jumps[row] - 2 * np.pi) < 0.5 and jumps[row] > 20 * np.median(jumps) + 1e-6:
+        raise RecordingError(
+            f"{channel.where}: jumps by {jumps[row]:.3g} rad after {channel.time[row]:.12g} s, a "
+            "wrapped angle; unwrap it (numpy.unwrap)"
+        )
+
+
+def _check_range(channel, warn):
+    """Values far outside the range that the model gives them."""
+    if not channel.limited:
+        return
+    values, span, column = channel.values, channel.span, channel.column
+    low, high, width = values.min(), values.max(), np.ptp(span)
+    largest = max(abs(low), abs(high))
+    if largest > 10 * np.abs(span).max() > 0:
+        unit = "degrees" if channel.hinge else "another unit than the model's"
+        raise RecordingError(
+            f"{channel.where}: reaches {largest:g} where the model's range is {span[0]:g} to "
+            f"{span[1]:g}; if it is in {unit}, convert it"
+        )
+    beyond = np.abs(values - np.mean(span)) > 0.75 * width  # stops are soft
+    if channel.kind == "qpos" and beyond.mean() > 0.03:
+        warn(
+            channel.recording,
+            f"{column} is far outside the joint's range in the model, {span[0]:g} to {span[1]:g}, "
+            "in {} of its rows; check that range and where the sensor's zero is",
+            beyond.mean(),
+        )
+    if channel.kind == "ctrl" and (low < span[0] - 1e-3 * width or high > span[1] + 1e-3 * width):
+        warn(
+            channel.recording,
+            f"{column} leaves the model's ctrlrange {span[0]:g} to {span[1]:g}; MuJoCo clips it "
+            "there",
+        )
+
+
+def _check_edges(channel, warn):
+    """Values that stay at their extremes."""
+    values, span, control = channel.values, channel.span, channel.kind == "ctrl"
+    low, high, rows = values.min(), values.max(), len(channel.recording.time)
+    kept = {
+        edge: np.count_nonzero((values[1:] == edge) & (values[:-1] == edge)) / rows
+        for edge in (low, high)
+    }
+    if kept[low] + kept[high] > 0.95:  # a square wave is not saturation
+        return
+    for edge, share in kept.items():
+        limit = span[int(edge == high)]
+        at_range = control and channel.limited and abs(edge - limit) < 1e-6 * (1 + abs(edge))
+        if share > 0.03 and (at_range or (low == -high if control else edge)):
+            why = (
+                "saturated at ctrlrange"
+                if at_range
+                else "saturated"
+                if control
+                else "clipped, or at a stop"
             )
-        beyond = np.abs(values - np.mean(span)) > 0.75 * np.ptp(span)  # stops are soft
-        if kind == "qpos" and limited and beyond.mean() > 0.03:
             warn(
-                recording,
-                f"{column} is far outside the joint's range in the model, {span[0]:g} to {span[1]:g}, in {{}} of its "
-                "rows; check that range and where the sensor's zero is",
-                beyond.mean(),
+                channel.recording,
+                f"{channel.column} stays at its extreme {edge:g} in {{}} of the rows: {why}",
+                share,
             )
-        if (
-            kind == "ctrl"
-            and limited
-            and (low < span[0] - 1e-3 * np.ptp(span) or high > span[1] + 1e-3 * np.ptp(span))
-        ):
-            warn(
-                recording,
-                f"{column} leaves the model's ctrlrange {span[0]:g} to {span[1]:g}; MuJoCo clips it there",
-            )
-        kept = {
-            edge: np.count_nonzero((values[1:] == edge) & (values[:-1] == edge)) / rows
-            for edge in (low, high)
-        }
-        switched = kept[low] + kept[high] > 0.95  # a square wave is not saturation
-        for edge, share in kept.items():
-            at_range = (
-                kind == "ctrl"
-                and limited
-                and abs(edge - span[int(edge == high)]) < 1e-6 * (1 + abs(edge))
-            )
-            if (
-                share > 0.03
-                and not switched
-                and (at_range or (edge if kind == "qpos" else low == -high))
-            ):
-                why = (
-                    "saturated at ctrlrange"
-                    if at_range
-                    else "saturated"
-                    if kind == "ctrl"
-                    else "clipped, or at a stop"
-                )
-                warn(
-                    recording,
-                    f"{column} stays at its extreme {edge:g} in {{}} of the rows: {why}",
-                    share,
-                )
 
 
 def _check_overlap(recording, model, warn):
-    """Geoms that the recorded positions put deep into each other: another origin, or another size."""
+    """Geoms that the recorded positions put deep into each other: another origin, or another
+    size."""
     rows = np.unique(np.linspace(0, len(recording.time) - 1, 40).astype(int))
     data, deep = mujoco.MjData(model), {}
     for row in rows:
@@ -294,91 +332,98 @@ def _check_overlap(recording, model, warn):
             names = " and ".join(model.geom(g).name or f"geom {g}" for g in (a, b))
             warn(
                 recording,
-                f"{names} overlap by {depth:.2g} m and more in {{}} of the rows; check the origin of the positions "
+                f"{names} overlap by {depth:.2g} m and more in {{}} of the rows; check the origin "
+                f"of the positions "
                 "and the model's sizes",
                 len(depths) / len(rows),
             )
 
 
 def _check_rates(recording, model, warn):
-    """Measured velocities against the change of the positions beside them: units, signs and swapped columns."""
+    """Measured velocities against the change of the positions beside them: units, signs, order."""
+    names, gone, travelled = _paths(recording, model)
+    for i, name in enumerate(names):
+        same = _alike(gone[i], travelled[i])
+        if same is None:
+            continue
+        where = f"{recording.name}: column 'qvel:{name}'"
+        if same < 0.5:
+            for other, title in enumerate(names):
+                if other != i and (_alike(gone[i], travelled[other]) or 0) > max(0.95, same + 0.4):
+                    raise RecordingError(
+                        f"{where}: does not follow 'qpos:{name}', but 'qvel:{title}' does; the "
+                        "columns are swapped"
+                    )
+        if same < -0.9:
+            raise RecordingError(
+                f"{where}: has the opposite sign of the change of 'qpos:{name}'; turn one of them "
+                "round"
+            )
+        if same > 0.9:
+            _check_scale(where, name, gone[i], travelled[i])
+        elif same < 0.5:
+            warn(
+                recording,
+                f"qvel:{name} hardly follows the change of qpos:{name} (correlation {same:.2f})",
+            )
+
+
+def _paths(recording, model):
+    """(names, changes of position, integrals of velocity) over some 60 ms from every row.
+
+    Of each coordinate whose velocity is its derivative: a ball joint's is none of its quaternion's.
+    """
     time = recording.time
     stride = max(1, int(round(0.03 / np.median(np.diff(time)))))
+    names, gone, travelled = [], [], []
     if len(time) < 4 * stride + 8:
-        return
-    gone, travelled, names = [], [], []
+        return names, gone, travelled
     for j in range(model.njnt):
-        if (
-            model.jnt_type[j] == 1
-        ):  # a ball joint's angular velocity is no derivative of its quaternion
+        if model.jnt_type[j] == 1:
             continue
         for k in range(3 if model.jnt_type[j] == 0 else 1):
-            q, v = (
-                recording.qpos[:, model.jnt_qposadr[j] + k],
-                recording.qvel[:, model.jnt_dofadr[j] + k],
-            )
+            q = recording.qpos[:, model.jnt_qposadr[j] + k]
+            v = recording.qvel[:, model.jnt_dofadr[j] + k]
             step = 0.5 * (v[1:] + v[:-1]) * np.diff(time)
             integral, holes = (
                 np.concatenate([[0], np.cumsum(x)]) for x in (np.nan_to_num(step), np.isnan(step))
             )
             whole = holes[2 * stride :] == holes[: -2 * stride]
             gone.append(q[2 * stride :] - q[: -2 * stride])
-            travelled.append(
-                np.where(whole, integral[2 * stride :] - integral[: -2 * stride], np.nan)
-            )
-            names.append(
-                (model.joint(j).name or str(j)) + (f":{k}" if model.jnt_type[j] == 0 else "")
-            )
+            way = integral[2 * stride :] - integral[: -2 * stride]
+            travelled.append(np.where(whole, way, np.nan))
+            part = f":{k}" if model.jnt_type[j] == 0 else ""
+            names.append((model.joint(j).name or str(j)) + part)
+    return names, gone, travelled
 
-    def alike(a, b):
-        both = ~np.isnan(a) & ~np.isnan(b)
-        if both.sum() < 20:
-            return None
-        a, b = a[both], b[both]
-        size = np.sqrt((a @ a) * (b @ b))
-        return (a @ b) / size if size > 1e-12 * both.sum() else None
 
-    for i, name in enumerate(names):
-        same = alike(gone[i], travelled[i])
-        if same is None:
-            continue
-        where = f"{recording.name}: column 'qvel:{name}'"
-        if same < 0.5:
-            for other, title in enumerate(names):
-                if other != i and (alike(gone[i], travelled[other]) or 0) > max(0.95, same + 0.4):
-                    raise RecordingError(
-                        f"{where}: does not follow 'qpos:{name}', but 'qvel:{title}' does; the columns "
-                        "are swapped"
-                    )
-        if same < -0.9:
-            raise RecordingError(
-                f"{where}: has the opposite sign of the change of 'qpos:{name}'; turn one of them round"
-            )
-        if same > 0.9:
-            both = ~np.isnan(gone[i]) & ~np.isnan(travelled[i])
-            ratio = np.sqrt(
-                (travelled[i][both] @ travelled[i][both]) / (gone[i][both] @ gone[i][both])
-            )
-            if not 0.4 < ratio < 2.5:
-                why = next(
-                    (
-                        text
-                        for factor, text in (
-                            (57.3, "qvel is in degrees beside qpos in rad, mixed units"),
-                            (1 / 57.3, "qpos is in degrees beside qvel in rad/s, mixed units"),
-                            (1000, "qvel is in mm/s, or time in ms"),
-                            (1e-3, "qpos is in mm"),
-                        )
-                        if 0.7 < ratio / factor < 1.4
-                    ),
-                    "one of them is in another unit",
-                )
-                raise RecordingError(
-                    f"{where}: is {ratio:.3g} times the change of 'qpos:{name}' per second; it seems {why}: "
-                    "use SI units"
-                )
-        elif same < 0.5:
-            warn(
-                recording,
-                f"qvel:{name} hardly follows the change of qpos:{name} (correlation {same:.2f})",
-            )
+def _alike(a, b):
+    """The correlation about 0 of two (N,), where both are known; None: nothing to compare."""
+    both = ~np.isnan(a) & ~np.isnan(b)
+    if both.sum() < 20:
+        return None
+    a, b = a[both], b[both]
+    size = np.sqrt((a @ a) * (b @ b))
+    return (a @ b) / size if size > 1e-12 * both.sum() else None
+
+
+def _check_scale(where, name, gone, travelled):
+    """Raises RecordingError where a velocity is a multiple of its position's change."""
+    both = ~np.isnan(gone) & ~np.isnan(travelled)
+    ratio = np.sqrt((travelled[both] @ travelled[both]) / (gone[both] @ gone[both]))
+    if 0.4 < ratio < 2.5:
+        return
+    units = (
+        (57.3, "qvel is in degrees beside qpos in rad, mixed units"),
+        (1 / 57.3, "qpos is in degrees beside qvel in rad/s, mixed units"),
+        (1000, "qvel is in mm/s, or time in ms"),
+        (1e-3, "qpos is in mm"),
+    )
+    why = next(
+        (text for factor, text in units if 0.7 < ratio / factor < 1.4),
+        "one of them is in another unit",
+    )
+    raise RecordingError(
+        f"{where}: is {ratio:.3g} times the change of 'qpos:{name}' per second; it seems {why}: "
+        "use SI units"
+    )

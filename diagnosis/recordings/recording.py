@@ -2,13 +2,15 @@
 
     recordings = load(["run1.csv", "run2.npz"], model)     # model: the nominal mujoco.MjModel
 
-A CSV has a header `time`, `qpos:<joint>`, optional `qvel:<joint>`, `ctrl:<actuator>`, optional `sensor:<name>`; free
-and ball joints and wide sensors take a component, `qpos:<joint>:0`. An unnamed joint, actuator or sensor goes by its
-index. An NPZ has `time (T,)`, `qpos (T, nq)`, `ctrl (T, nu)` and optionally `qvel (T, nv)` and `sensor:<name> (T, k)`.
-ROS 2 bags, LeRobot and Minari datasets and PACE dictionaries are read too (formats/), and columns under other names by a
-Layout (columns.py). Units are SI: s, m, rad, N, N·m.
+A CSV has a header `time`, `qpos:<joint>`, optional `qvel:<joint>`, `ctrl:<actuator>`, optional
+`sensor:<name>`; free and ball joints and wide sensors take a component, `qpos:<joint>:0`. An
+unnamed joint, actuator or sensor goes by its index. An NPZ has `time (T,)`, `qpos (T, nq)`, `ctrl
+(T, nu)` and optionally `qvel (T, nv)` and `sensor:<name> (T, k)`. ROS 2 bags, LeRobot and Minari
+datasets and PACE dictionaries are read too (formats/), and columns under other names by a Layout
+(columns.py). Units are SI: s, m, rad, N, N·m.
 
-Row t is the state at time[t] and the control held from time[t] to time[t+1]. NaN, or an empty cell, is "not measured".
+Row t is the state at time[t] and the control held from time[t] to time[t+1]. NaN, or an empty cell,
+is "not measured".
 """
 
 import os
@@ -31,12 +33,14 @@ LARGEST = {
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One continuous run, equal to itself alone. NaN: not measured. Columns stand in MuJoCo's order.
+    """One continuous run, equal to itself alone. NaN: not measured. Columns stand in MuJoCo's
+    order.
 
-    name: file name; time (T,) s, increasing; qpos (T, nq) m or rad; qvel (T, nv), all NaN when absent;
-    ctrl (T, nu), without NaN; sensors: name -> (T, k). start: the row from which on it is predicted where it is held out;
-    those before only say what led there, such as controls that are still on their way. gains: {joint: {"kp", "kd"}} of
-    the controllers whose targets the controls are, where the file says so. notes: what its reader found odd, one line each.
+    name: file name; time (T,) s, increasing; qpos (T, nq) m or rad; qvel (T, nv), all NaN when
+    absent; ctrl (T, nu), without NaN; sensors: name -> (T, k). start: the row from which on it is
+    predicted where it is held out; those before only say what led there, such as controls that are
+    still on their way. gains: {joint: {"kp", "kd"}} of the controllers whose targets the controls
+    are, where the file says so. notes: what its reader found odd, one line each.
     """
 
     name: str
@@ -66,8 +70,8 @@ class Recording:
 def load(paths, model, layout=Layout()):
     """Read files, bags and datasets into a list of Recording, in the order given.
 
-    paths: one path or several. model: mujoco.MjModel whose names they use, or to whose names `layout` brings them.
-    Raises RecordingError on the first thing that is wrong.
+    paths: one path or several. model: mujoco.MjModel whose names they use, or to whose names
+    `layout` brings them. Raises RecordingError on the first thing that is wrong.
     """
     paths = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     if not paths:
@@ -89,7 +93,8 @@ def load(paths, model, layout=Layout()):
 
 
 def _folders(paths):
-    """What has to stand in front of the last part of each path to tell it from the others': "", or "run1/" of run1/data.csv."""
+    """What has to stand in front of the last part of each path to tell it from the others': "", or
+    "run1/" of run1/data.csv."""
     parts, out = [os.path.abspath(path).split(os.sep) for path in paths], []
     for mine in parts:
         most = next(
@@ -102,8 +107,8 @@ def _folders(paths):
 
 
 def accepted(recording, model):
-    """A Recording that somebody made in Python, as `load` would have made it. Raises RecordingError as `load` does; rows
-    are counted from 0."""
+    """A Recording that somebody made in Python, as `load` would have made it. Raises RecordingError
+    as `load` does; rows are counted from 0."""
     name, arrays = (
         str(recording.name),
         {"time": recording.time, "qpos": recording.qpos, "ctrl": recording.ctrl},
@@ -115,50 +120,19 @@ def accepted(recording, model):
     made = _recording(name, name, columns, model, 0)
     if not 0 <= recording.start < len(made.time) - 1:
         raise RecordingError(
-            f"{name}: start is row {recording.start} of {len(made.time)}; at least two rows have to "
+            f"{name}: start is row {recording.start} of {len(made.time)}; at least two rows have "
+            f"to "
             "follow it"
         )
     return replace(made, start=recording.start)
 
 
 def _recording(path, name, columns, model, first_row):
-    """Columns to a Recording. Raises RecordingError on time that does not increase, NaN controls but in the last row, impossible values."""
+    """Columns to a Recording. Raises RecordingError on time that does not increase, NaN controls
+    but in the last row, impossible values."""
     time = columns["time"]
-    for column, values in columns.items():
-        kind = column.split(":")[0]
-        if (
-            kind == "ctrl" and len(values) > 1 and np.isnan(values[-1])
-        ):  # it would act after the last row: some loggers leave it out
-            columns[column] = values = np.append(values[:-1], values[-2])
-        bad = np.isinf(values) | (np.abs(values) > LARGEST[kind])
-        if kind in ("time", "ctrl"):
-            bad |= np.isnan(values)
-        if bad.any():
-            row = int(np.argmax(bad))
-            do = {
-                "time": "every row needs a time in seconds",
-                "ctrl": "every row needs its control",
-            }.get(kind, "write nan where nothing was measured, and SI units elsewhere")
-            raise RecordingError(
-                f"{path}: row {row + first_row}, column {column!r}: {values[row]:g}; {do}"
-            )
-    if len(time) < 2:
-        raise RecordingError(
-            f"{path}: {len(time)} row{'s' * (len(time) != 1)}: not enough data; a run needs at least "
-            "two rows, and some seconds of motion to say anything"
-        )
-    back = np.diff(time) <= 0
-    if back.any():
-        row = int(np.argmax(back)) + 1
-        word = "repeats" if time[row] == time[row - 1] else "runs backward from"
-        do = (
-            "write time with more digits"
-            if word == "repeats" and back.mean() > 0.2 and np.ptp(time) > 0
-            else "remove repeated rows, sort them, and put separate runs into separate files"
-        )
-        raise RecordingError(
-            f"{path}: row {row + first_row}, column 'time': {time[row]:.15g} {word} {time[row - 1]:.15g}; {do}"
-        )
+    columns = {c: _possible(path, c, values, first_row) for c, values in columns.items()}
+    _increasing(path, time, first_row)
     arrays = {
         "qpos": np.full((len(time), model.nq), np.nan),
         "qvel": np.full((len(time), model.nv), np.nan),
@@ -172,9 +146,8 @@ def _recording(path, name, columns, model, first_row):
         kind, k = known[column]
         if kind.startswith("sensor:"):
             width = sum(place == kind for place, _ in known.values())
-            sensors.setdefault(kind[len("sensor:") :], np.full((len(time), width), np.nan))[
-                :, k
-            ] = values
+            empty = np.full((len(time), width), np.nan)
+            sensors.setdefault(kind[len("sensor:") :], empty)[:, k] = values
         else:
             arrays[kind][:, k] = values
     if model.nq and np.isnan(arrays["qpos"]).all():
@@ -182,9 +155,53 @@ def _recording(path, name, columns, model, first_row):
             f"{path}: no position is measured, every qpos is nan; at least one joint is needed"
         )
     _quaternions(path, arrays["qpos"], model, first_row)
-    return Recording(
-        name.encode("utf-8", "replace").decode(), time, sensors=sensors, **arrays
-    )  # a name can hold any byte
+    name = name.encode("utf-8", "replace").decode()  # it can hold any byte
+    return Recording(name, time, sensors=sensors, **arrays)
+
+
+def _possible(path, column, values, first_row):
+    """The values of a column. Raises RecordingError on one that no unit explains, or that is
+    missing where it must not."""
+    kind = column.split(":")[0]
+    if kind == "ctrl" and len(values) > 1 and np.isnan(values[-1]):
+        # it would act after the last row: some loggers leave it out
+        values = np.append(values[:-1], values[-2])
+    bad = np.isinf(values) | (np.abs(values) > LARGEST[kind])
+    if kind in ("time", "ctrl"):
+        bad |= np.isnan(values)
+    if bad.any():
+        row = int(np.argmax(bad))
+        do = {
+            "time": "every row needs a time in seconds",
+            "ctrl": "every row needs its control",
+        }.get(kind, "write nan where nothing was measured, and SI units elsewhere")
+        raise RecordingError(
+            f"{path}: row {row + first_row}, column {column!r}: {values[row]:g}; {do}"
+        )
+    return values
+
+
+def _increasing(path, time, first_row):
+    """Raises RecordingError where there are no two times, or one is no later than the one
+    before."""
+    if len(time) < 2:
+        raise RecordingError(
+            f"{path}: {len(time)} row{'s' * (len(time) != 1)}: not enough data; a run needs at "
+            "least two rows, and some seconds of motion to say anything"
+        )
+    back = np.diff(time) <= 0
+    if back.any():
+        row = int(np.argmax(back)) + 1
+        word = "repeats" if time[row] == time[row - 1] else "runs backward from"
+        do = (
+            "write time with more digits"
+            if word == "repeats" and back.mean() > 0.2 and np.ptp(time) > 0
+            else "remove repeated rows, sort them, and put separate runs into separate files"
+        )
+        raise RecordingError(
+            f"{path}: row {row + first_row}, column 'time': {time[row]:.15g} {word} "
+            f"{time[row - 1]:.15g}; {do}"
+        )
 
 
 def _quaternions(path, qpos, model, first_row):
@@ -201,6 +218,7 @@ def _quaternions(path, qpos, model, first_row):
             what = "is partly nan" if partly[row] else f"has length {norm[row]:.4g} instead of 1"
             first = f"qpos:{model.joint(j).name or j}:{end - 4 - model.jnt_qposadr[j]}"
             raise RecordingError(
-                f"{path}: row {row + first_row}, column {first!r} and the next three: the quaternion {what}; "
+                f"{path}: row {row + first_row}, column {first!r} and the next three: the "
+                f"quaternion {what}; "
                 "order is w x y z"
             )

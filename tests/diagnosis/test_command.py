@@ -1,4 +1,5 @@
-"""The command: what it refuses and how, how it splits, what it says, and that a diagnosis comes out."""
+"""The command: what it refuses and how, how it splits, what it says, and that a diagnosis comes
+out."""
 
 import dataclasses
 import json
@@ -25,7 +26,8 @@ CASES = cases()
 
 
 def refused(code, out, err, folder, before, says):
-    """Exit status 2, one line on stderr with the right hint, nothing on stdout, nothing left behind."""
+    """Exit status 2, one line on stderr with the right hint, nothing on stdout, nothing left
+    behind."""
     assert code == 2
     assert out == ""
     lines = err.splitlines()
@@ -109,14 +111,18 @@ def test_a_folder_that_is_named_like_an_environment(tmp_path, monkeypatch):
         diagnose.diagnose("InvertedPendulum-v4", ["nowhere.csv"])
 
 
-INTEGRATOR = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint name="j" axis="0 1 0" damping="0.3"/>
-  <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+INTEGRATOR = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint
+name="j" axis="0 1 0" damping="0.3"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0"
+  conaffinity="0"/></body></worldbody>
   <actuator><intvelocity name="drive" joint="j" kp="20" actrange="-2 2"/></actuator></mujoco>"""
 
 
 def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
-    """A servo that integrates its control: stock MuJoCo's record of the nominal model itself, without noise. Its target at
-    the cut is that of the rows before, so the nominal model predicts the tail; from a target of 0 it misses by far."""
+    """A servo that integrates its control: stock MuJoCo's record of the nominal model itself,
+    without noise. Its target at
+    the cut is that of the rows before, so the nominal model predicts the tail; from a target of 0
+    it misses by far."""
     model = mujoco.MjModel.from_xml_string(INTEGRATOR)
     data, rows = mujoco.MjData(model), []
     for _ in range(300):
@@ -147,7 +153,8 @@ def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
         ),
         (
             {"qpos": np.zeros((400, 3))},
-            "made.py: array 'qpos' has shape (400, 3) instead of (400, 2); this model has 2 of them",
+            "made.py: array 'qpos' has shape (400, 3) instead of (400, 2); this model has 2 of "
+            "them",
         ),
         (
             {"qvel": np.full((400, 2), None)},
@@ -211,9 +218,12 @@ def test_one_file_for_two_purposes_is_refused(tmp_path):
 
 
 def pendulum(frictionloss):
-    return f"""<mujoco model="pendulum"><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="rod">
-      <joint name="pivot" axis="0 1 0" damping="0.02" frictionloss="{frictionloss}" solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"/>
-      <geom name="stick" type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+    return f"""<mujoco model="pendulum"><option timestep="0.002"
+    integrator="implicitfast"/><worldbody><body name="rod">
+      <joint name="pivot" axis="0 1 0" damping="0.02" frictionloss="{frictionloss}"
+      solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"/>
+      <geom name="stick" type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0"
+      conaffinity="0"/></body></worldbody>
       <actuator><motor name="motor" joint="pivot"/></actuator></mujoco>"""
 
 
@@ -233,7 +243,8 @@ def swing(frictionloss, seed, seconds=6.0, noise=5e-4):
 
 @pytest.fixture(scope="module")
 def command(tmp_path_factory):
-    """(folder, finished process) of one real run of the command: a pendulum whose Coulomb friction was left out."""
+    """(folder, finished process) of one real run of the command: a pendulum whose Coulomb friction
+    was left out."""
     folder = tmp_path_factory.mktemp("command")
     (folder / "sim.xml").write_text(pendulum(0))
     for k in range(3):
@@ -326,7 +337,8 @@ def test_a_fault_of_the_program_is_one_line_too(tmp_path, capsys, monkeypatch):
     assert diagnose.main(CASES["empty file"].write(tmp_path)) == 1
     err = capsys.readouterr().err
     assert err.startswith(
-        "diagnose.py: a fault of this program, not of its input: LinAlgError in test_command.py, line "
+        "diagnose.py: a fault of this program, not of its input: LinAlgError in test_command.py, "
+        "line "
     )
     assert err.count("\n") == 1 and "(Singular matrix)" in err
 
@@ -350,10 +362,13 @@ def test_a_terminal_that_cannot_show_a_sign(command):
         [
             sys.executable,
             "-c",
-            "import sys; sys.path.insert(0, sys.argv[1]); from diagnosis import command; import types, json; "
-            "s = json.load(open('report/diagnosis.json')); command.writer.write = lambda *a: ['unknown_1.csv']; "
+            "import sys; sys.path.insert(0, sys.argv[1]); from diagnosis import command; import "
+            "types, json; "
+            "s = json.load(open('report/diagnosis.json')); command.writer.write = lambda *a: "
+            "['unknown_1.csv']; "
             "command.diagnose = lambda *a: types.SimpleNamespace(summary=s); "
-            "sys.exit(command.main(['--model', 'sim.xml', '--recordings', 'run0.csv', '--out', 'x']))",
+            "sys.exit(command.main(['--model', 'sim.xml', '--recordings', 'run0.csv', '--out', "
+            "'x']))",
             ROOT,
         ],
         capture_output=True,
@@ -440,7 +455,8 @@ def finding(effect, kind, name, *parameters, **more):
         ),
         (
             finding("unknown", "joint", "elbow", depends_on=["position:elbow", "contact:floor"]),
-            "joint elbow: a force that the catalogue has no name for, depending on the position of elbow and contact with floor",
+            "joint elbow: a force that the catalogue has no name for, depending on the position "
+            "of elbow and contact with floor",
         ),
         (
             finding("gravity", "world", "world", parameter("z", -9.81, -9.5, 0.01, "m/s²")),

@@ -2,8 +2,10 @@
 
     for raw in read("run.csv", model, Layout()): ...
 
-CSV, NPZ, ROS 2 bags, LeRobot datasets, PACE dictionaries and Minari datasets. Those that need a library of their own name
-it where it is not installed. Nothing is ever unpickled. Every fault raises RecordingError with one line: file, row,
+CSV, NPZ, ROS 2 bags, LeRobot datasets, PACE dictionaries and Minari datasets. Those that need a
+library of their own name
+it where it is not installed. Nothing is ever unpickled. Every fault raises RecordingError with one
+line: file, row,
 column, and what to do.
 """
 
@@ -40,7 +42,8 @@ BAGS = (b"SQLite format 3\x00", b"\x89MCAP0\r\n")
 
 
 def read(path: str, model, layout: Layout) -> list[Raw]:
-    """The runs of one file or folder, each with columns by the file's own names. Raises RecordingError."""
+    """The runs of one file or folder, each with columns by the file's own names. Raises
+    RecordingError."""
     if os.path.isdir(path) or not os.path.exists(path) and not os.path.splitext(path)[1]:
         return _folder(path, model, layout)
     data = _bytes(path)

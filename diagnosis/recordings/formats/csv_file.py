@@ -47,13 +47,15 @@ def _parts(path, data):
         ]  # quoted after a space
     except csv.Error as error:
         raise RecordingError(
-            f"{path}: row {above + 1}: the header cannot be read ({error}); write plain column names"
+            f"{path}: row {above + 1}: the header cannot be read ({error}); write plain column "
+            f"names"
         ) from None
     if "time" not in header:
         for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars"), (" ", "spaces")):
             if "time" in [cell.strip(' "') for cell in first.split(mark)]:
                 raise RecordingError(
-                    f"{path}: row {above + 1}: columns are separated by {name}; separate them by commas"
+                    f"{path}: row {above + 1}: columns are separated by {name}; separate them by "
+                    f"commas"
                 )
         if all(_number(cell) is not None for cell in header):
             raise RecordingError(
@@ -82,8 +84,8 @@ def _table(path, body, header, first_row):
 
 
 def _checked(path, header, model, layout):
-    """The header, complete for the model. Raises RecordingError on unknown, repeated or missing columns, before any row is
-    read."""
+    """The header, complete for the model. Raises RecordingError on unknown, repeated or missing
+    columns, before any row is read."""
     known = Names(model)
     seen = []
     for position, name in enumerate(header, start=1):
@@ -100,7 +102,8 @@ def _checked(path, header, model, layout):
 
 
 def _header_line(text):
-    """(lines above it, the header, all that follows): comments may stand above, and numpy.savetxt writes "# time,..."."""
+    """(lines above it, the header, all that follows): comments may stand above, and numpy.savetxt
+    writes "# time,..."."""
     above, rest = 0, text
     while True:
         first, _, rest = rest.partition("\n")
@@ -111,7 +114,8 @@ def _header_line(text):
 
 
 def _slow(path, body, names, first_row):
-    """(T, columns) of a CSV body cell by cell: empty cells are NaN, anything else odd raises RecordingError."""
+    """(T, columns) of a CSV body cell by cell: empty cells are NaN, anything else odd raises
+    RecordingError."""
     rows = []
     lines = body.rstrip().split("\n")
     for row, line in enumerate(lines, start=first_row):
@@ -129,7 +133,8 @@ def _slow(path, body, names, first_row):
                 else ""
             )
             raise RecordingError(
-                f"{path}: row {row}: {len(cells)} cells where the header has {len(names)}; repair the "
+                f"{path}: row {row}: {len(cells)} cells where the header has {len(names)}; repair "
+                f"the "
                 f"row{why}"
             )
         values = [float("nan") if cell == "" else _number(cell) for cell in cells]

@@ -1,8 +1,10 @@
-"""LeRobot datasets (Parquet, v2 and v3): one run for each episode of a folder, or of one .parquet file.
+"""LeRobot datasets (Parquet, v2 and v3): one run for each episode of a folder, or of one .parquet
+file.
 
-`meta/info.json` names the parts of `observation.state` and `action`. A part called `elbow.pos` is the position of joint
-elbow (or where it is told to go, in `action`), `.vel` its velocity, `.torque` or `.effort` its torque; a name without an
-ending is a position. In a column map a part is `observation.state.elbow.pos`, or `observation.state[1]`.
+`meta/info.json` names the parts of `observation.state` and `action`. A part called `elbow.pos` is
+the position of joint elbow (or where it is told to go, in `action`), `.vel` its velocity, `.torque`
+or `.effort` its torque; a name without an ending is a position. In a column map a part is
+`observation.state.elbow.pos`, or `observation.state[1]`.
 """
 
 import json
@@ -93,7 +95,8 @@ def _file(path, info):
                 natural.setdefault(f"{kind}:{joint}", f"{key}.{part}")
     if "timestamp" not in columns:
         raise RecordingError(
-            f"{path}: no column 'timestamp'; it has {', '.join(map(repr, numbers[:8]))}; is it a LeRobot dataset?"
+            f"{path}: no column 'timestamp'; it has {', '.join(map(repr, numbers[:8]))}; is it a "
+            f"LeRobot dataset?"
         )
     columns["time"], natural["time"] = columns["timestamp"], "time"
     return columns, natural

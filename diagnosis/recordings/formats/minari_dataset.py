@@ -13,7 +13,8 @@ class MinariDataset:
     """Reads what Minari stores, through Minari itself (pip install 'minari[hdf5]')."""
 
     def read(self, path, model, layout: Layout) -> list[Raw]:
-        """One run for each episode of a dataset, given by id or by folder. Raises RecordingError."""
+        """One run for each episode of a dataset, given by id or by folder. Raises
+        RecordingError."""
         name, out = os.path.basename(os.path.normpath(path)), []
         for number, arrays in _episodes(path, model):
             columns = by_column(path, arrays, model)
@@ -65,8 +66,9 @@ def _episodes(path, model):
 
 
 def _episode(path, episode, model, dt):
-    """Arrays of one Minari episode. qpos and qvel come from its infos where stored, else from the observation, which
-    in gymnasium's MuJoCo tasks is (qpos, qvel), often without the root's leading positions: those are NaN."""
+    """Arrays of one Minari episode. qpos and qvel come from its infos where stored, else from the
+    observation, which in gymnasium's MuJoCo tasks is (qpos, qvel), often without the root's leading
+    positions: those are NaN."""
     actions = np.asarray(episode.actions, dtype=float).reshape(len(episode.actions), -1)
     ctrl = np.vstack([actions, actions[-1:]])  # the last state has no action of its own
     infos = episode.infos or {}
@@ -75,7 +77,8 @@ def _episode(path, episode, model, dt):
     else:
         if isinstance(episode.observations, dict):
             raise RecordingError(
-                f"{path}: observations are a dictionary without qpos and qvel infos; convert it to NPZ"
+                f"{path}: observations are a dictionary without qpos and qvel infos; convert it "
+                f"to NPZ"
             )
         seen = np.asarray(episode.observations, dtype=float)
         left_out = model.nq + model.nv - (seen.shape[1] if seen.ndim == 2 else 0)

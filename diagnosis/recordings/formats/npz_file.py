@@ -1,6 +1,8 @@
-"""NPZ: the arrays time (T,), qpos (T, nq), ctrl (T, nu), optional qvel (T, nv) and sensor:<name> (T, k), in MuJoCo's order.
+"""NPZ: the arrays time (T,), qpos (T, nq), ctrl (T, nu), optional qvel (T, nv) and sensor:<name>
+(T, k), in MuJoCo's order.
 
-With a column map, arrays of any other names too: `name` is one of (T,), `name[k]` column k of one of (T, n).
+With a column map, arrays of any other names too: `name` is one of (T,), `name[k]` column k of one
+of (T, n).
 """
 
 import difflib
@@ -15,6 +17,21 @@ from diagnosis.recordings.layout import Layout, Raw
 
 LARGEST_NPZ = 4 << 30  # bytes unpacked: a small archive can claim to hold terabytes
 OURS = "time", "qpos", "qvel", "ctrl"
+DAMAGED = (  # what numpy raises on archives that are not what they claim
+    ValueError,
+    OSError,
+    EOFError,
+    KeyError,
+    MemoryError,
+    RuntimeError,
+    NotImplementedError,
+    OverflowError,
+    SyntaxError,
+    TypeError,
+    AttributeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 class NpzFile:
@@ -56,44 +73,36 @@ def _arrays(path, data, anything):
                 )
             if "[Content_Types].xml" in archive.namelist():
                 raise RecordingError(f"{path}: an Excel workbook; save the sheet as CSV")
-        arrays = {}
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            for key in archive.files:
-                if anything or key in OURS or key.startswith("sensor:"):
-                    try:
-                        arrays[key] = archive[key]
-                    except ValueError as error:
-                        if "pickle" in str(error).lower():
-                            raise RecordingError(
-                                f"{path}: array {key!r} holds pickled objects, which are never loaded; "
-                                "save a plain array of floats"
-                            ) from None
-                        raise
-                else:
-                    close = difflib.get_close_matches(key.lower(), OURS, n=1, cutoff=0.7)
-                    if close:
-                        raise RecordingError(
-                            f"{path}: array {key!r} is not known; did you mean {close[0]!r}?"
-                        )
+            known = [key for key in archive.files if _known(path, key, anything)]
+            return {key: _array(path, archive, key) for key in known}
     except RecordingError:
         raise
-    except (
-        ValueError,
-        OSError,
-        EOFError,
-        KeyError,
-        MemoryError,
-        RuntimeError,
-        NotImplementedError,
-        OverflowError,
-        SyntaxError,
-        TypeError,
-        AttributeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except DAMAGED as error:
         raise RecordingError(
             f"{path}: not a readable NPZ file ({type(error).__name__}); save it again with "
             "numpy.savez"
         ) from None
-    return arrays
+
+
+def _known(path, key, anything):
+    """Whether an array is read. Raises RecordingError where its name seems misspelt."""
+    if anything or key in OURS or key.startswith("sensor:"):
+        return True
+    close = difflib.get_close_matches(key.lower(), OURS, n=1, cutoff=0.7)
+    if close:
+        raise RecordingError(f"{path}: array {key!r} is not known; did you mean {close[0]!r}?")
+    return False
+
+
+def _array(path, archive, key):
+    """One array. Raises RecordingError where it would have to be unpickled."""
+    try:
+        return archive[key]
+    except ValueError as error:
+        if "pickle" in str(error).lower():
+            raise RecordingError(
+                f"{path}: array {key!r} holds pickled objects, which are never loaded; save a "
+                "plain array of floats"
+            ) from None
+        raise

@@ -1,8 +1,8 @@
 """PACE's dictionaries: torch.save({"time": (T,), "dof_pos": (T, n), "des_dof_pos": (T, n)}).
 
-Also read where they stand beside these: dof_vel (T, n), dof_torque (T, n), kp and kd (n,). The n joints are the model's
-hinges and slides in MuJoCo's order; a column map names others, `dof_pos[0]` being the first. Loaded with
-weights_only=True, so nothing is unpickled but tensors and numbers.
+Also read where they stand beside these: dof_vel (T, n), dof_torque (T, n), kp and kd (n,). The n
+joints are the model's hinges and slides in MuJoCo's order; a column map names others, `dof_pos[0]`
+being the first. Loaded with weights_only=True, so nothing is unpickled but tensors and numbers.
 """
 
 import io
@@ -33,7 +33,8 @@ class PaceDictionary:
         for key in () if layout.mapped else ("time", "dof_pos", "des_dof_pos"):
             if key not in arrays:
                 raise RecordingError(
-                    f"{path}: {key!r} is missing; a PACE dictionary has time (T,), dof_pos and des_dof_pos (T, n)"
+                    f"{path}: {key!r} is missing; a PACE dictionary has time (T,), dof_pos and "
+                    f"des_dof_pos (T, n)"
                 )
         rows = max((len(a) for a in arrays.values() if a.ndim), default=0)
         arrays = {
@@ -44,11 +45,13 @@ class PaceDictionary:
         for key, array in arrays.items():
             if len(array) != rows:
                 raise RecordingError(
-                    f"{path}: {key!r} has {len(array)} rows where others have {rows}; save whole runs"
+                    f"{path}: {key!r} has {len(array)} rows where others have {rows}; save whole "
+                    f"runs"
                 )
             if key in KINDS and not layout.columns and array.shape != (rows, len(joints)):
                 raise RecordingError(
-                    f"{path}: {key!r} has shape {array.shape} instead of ({rows}, {len(joints)}): this model has "
+                    f"{path}: {key!r} has shape {array.shape} instead of ({rows}, {len(joints)}): "
+                    f"this model has "
                     f"{len(joints)} hinges and slides; give the model of these joints, or --map"
                 )
         columns = apart(arrays)
@@ -67,9 +70,10 @@ def _loaded(path, data):
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # whatever damaged archives make torch raise
         why = (
-            "it holds other objects than tensors, which are never loaded; save a plain dictionary of tensors"
+            "it holds other objects than tensors, which are never loaded; save a plain dictionary "
+            "of tensors"
             if "weights_only" in str(error).lower() or "Unsupported" in str(error)
-            else f"not a readable torch file ({type(error).__name__}); save it again with torch.save"
+            else f"not a readable torch file ({type(error).__name__}); save it with torch.save"
         )
         raise RecordingError(f"{path}: {why}") from None
     if not isinstance(content, dict):

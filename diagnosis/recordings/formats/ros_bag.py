@@ -1,9 +1,12 @@
-"""ROS 2 bags (.db3, .mcap, or their folder): positions, velocities and efforts of sensor_msgs/JointState.
+"""ROS 2 bags (.db3, .mcap, or their folder): positions, velocities and efforts of
+sensor_msgs/JointState.
 
-A joint's own columns are `<joint>.position`, `.velocity`, `.effort` and, from the topic of targets, `.target`; they become
-qpos, qvel, effort and target of that joint. Time is the messages' stamp, or when they were recorded where they carry none.
-In a column map, `[ros]` may name `topic` and `targets`, and `joints` (in the order of the targets, where these are a bare
-std_msgs/Float64MultiArray). Targets are JointState, Float64MultiArray or a trajectory controller's state (its reference).
+A joint's own columns are `<joint>.position`, `.velocity`, `.effort` and, from the topic of targets,
+`.target`; they become qpos, qvel, effort and target of that joint. Time is the messages' stamp, or
+when they were recorded where they carry none. In a column map, `[ros]` may name `topic` and
+`targets`, and `joints` (in the order of the targets, where these are a bare
+std_msgs/Float64MultiArray). Targets are JointState, Float64MultiArray or a trajectory controller's
+state (its reference).
 """
 
 import os
@@ -38,7 +41,8 @@ class RosBag:
             raise
         except Exception as error:  # whatever damaged databases make the library raise
             raise RecordingError(
-                f"{path}: not a readable ROS 2 bag ({' '.join(str(error).split()) or type(error).__name__}); record it "
+                f"{path}: not a readable ROS 2 bag "
+                f"({' '.join(str(error).split()) or type(error).__name__}); record it "
                 "again, or repair it (ros2 bag reindex)"
             ) from None
         if not states:
@@ -62,25 +66,29 @@ def _bag(path):
         files = sorted([*place.glob("*.mcap"), *place.glob("*.db3")])
         if len(files) > 1:
             raise RecordingError(
-                f"{path}: several bag files and no metadata.yaml; name one of them, as in {files[0]}"
+                f"{path}: several bag files and no metadata.yaml; name one of them, as in "
+                f"{files[0]}"
             )
         return files[0]
     return place
 
 
 def _topic(path, bag, layout):
-    """The connections of the topic of joint states. Raises RecordingError where there is none, or no telling which."""
+    """The connections of the topic of joint states. Raises RecordingError where there is none, or
+    no telling which."""
     if "topic" in layout.ros:
         return _named(path, bag, layout.ros["topic"], layout)
     topics = sorted({c.topic for c in bag.connections if c.msgtype == STATE})
     if not topics:
         has = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in bag.connections})[:8])
         raise RecordingError(
-            f"{path}: no topic of sensor_msgs/JointState; it has {has or 'no topics'}; record /joint_states too"
+            f"{path}: no topic of sensor_msgs/JointState; it has {has or 'no topics'}; record "
+            f"/joint_states too"
         )
     if len(topics) > 1 and USUAL not in topics:
         raise RecordingError(
-            f'{path}: several topics of joint states ({", ".join(topics)}); name one: --map with [ros] topic = "..."'
+            f"{path}: several topics of joint states ({', '.join(topics)}); name one: --map with "
+            f'[ros] topic = "..."'
         )
     return _named(path, bag, USUAL if USUAL in topics else topics[0], layout)
 
@@ -111,9 +119,11 @@ def _stamps(messages):
 
 
 def _states(path, messages):
-    """((T,) ns, {"<joint>.position": (T,), ...}, notes) of JointState messages; nan where a message leaves a joint out.
+    """((T,) ns, {"<joint>.position": (T,), ...}, notes) of JointState messages; nan where a message
+    leaves a joint out.
 
-    Messages with the stamp of the one before are joined with it: several publishers may share the topic.
+    Messages with the stamp of the one before are joined with it: several publishers may share the
+    topic.
     """
     if not hasattr(messages[0][1], "position"):
         raise RecordingError(f"{path}: the topic holds no sensor_msgs/JointState")
@@ -148,7 +158,8 @@ def _held(values):
 
 
 def _targets(path, messages, time, layout):
-    """{"<joint>.target": (T,)}: the last target told at or before each row. Raises RecordingError on unknown messages."""
+    """{"<joint>.target": (T,)}: the last target told at or before each row. Raises RecordingError
+    on unknown messages."""
     stamps, messages = _stamps(messages), [m for _, m in messages]
     row = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, None)
     told = [_told(path, m, layout) for m in messages]
@@ -169,9 +180,11 @@ def _told(path, message, layout):
         joints = layout.ros.get("joints")
         if not joints:
             raise RecordingError(
-                f"{path}: the targets carry no names of joints; say their order: --map with [ros] joints = [...]"
+                f"{path}: the targets carry no names of joints; say their order: --map with [ros] "
+                f"joints = [...]"
             )
         return dict(zip(joints, message.data))
     raise RecordingError(
-        f"{path}: the topic of targets holds neither JointState, Float64MultiArray nor a controller's state"
+        f"{path}: the topic of targets holds neither JointState, Float64MultiArray nor a "
+        f"controller's state"
     )

@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnosis.command import _world
 from diagnosis.estimation import initial_states, multiple_shooting
 from diagnosis.estimation.observer import observed
 from diagnosis.estimation.residuals import Hypothesis, Problem
 from diagnosis.estimation.windows import consecutive, recorded_starts
+from diagnosis.nominal.model import load_world as _world
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import World
 from envs import model_path

@@ -35,7 +35,8 @@ def test_sound_recordings_stay(noise, counts):
 
 
 def test_readings_that_are_alike_by_chance_stay():
-    """Among 16000 noisy readings of seven digits two or so are as the row before, and the next is far from them."""
+    """Among 16000 noisy readings of seven digits two or so are as the row before, and the next is
+    far from them."""
     time = np.arange(8000) * 0.002
     motion = 0.4 * np.sin(np.outer(time, [1.0, 1.7]))
     for seed in range(20):
@@ -59,8 +60,10 @@ def test_rest_and_starting_from_it_stay():
 
 
 def test_a_bouncing_ball_stays():
-    model = mujoco.MjModel.from_xml_string("""<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="1 1 1" solref="-20000 -5"/>
-        <body pos="0 0 .6"><freejoint name="ball"/><geom size=".1" solref="-20000 -5" priority="1"/></body></worldbody></mujoco>""")
+    model = mujoco.MjModel.from_xml_string("""<mujoco><option timestep="0.002"/><worldbody><geom
+    type="plane" size="1 1 1" solref="-20000 -5"/>
+        <body pos="0 0 .6"><freejoint name="ball"/><geom size=".1" solref="-20000 -5"
+        priority="1"/></body></worldbody></mujoco>""")
     data, rows = mujoco.MjData(model), []
     data.qvel[:] = 0.3, 0, 0, 0, 5, 0
     for _ in range(400):
@@ -97,7 +100,8 @@ def test_spikes_and_dropouts(length):
     )
     share = "less than 1 %" if length == 1 else f"{100 * 3 * length / 400:.0f} %"
     assert notes == [
-        f"run.csv: qpos:elbow jumps away and back in {share} of its rows, which count as not measured"
+        f"run.csv: qpos:elbow jumps away and back in {share} of its rows, which count as not "
+        f"measured"
     ]
 
 
@@ -145,6 +149,7 @@ def test_many_recordings_are_one_line():
         frozen.append(replace(sound, qpos=qpos))
     _, notes = without_defects(frozen, arm())
     assert notes == [
-        "run0.csv and 2 more: qpos:shoulder repeats its last value and then catches up in up to 3 % of its rows, "
+        "run0.csv and 2 more: qpos:shoulder repeats its last value and then catches up in up to 3 "
+        "% of its rows, "
         "which count as not measured"
     ]

@@ -145,7 +145,8 @@ def test_joints_of_other_names_and_one_too_many(tmp_path, model, good):
 
 
 def lerobot(folder, good, episodes=2, names=True, version=3):
-    """A dataset as the library lays it out, observation.state of positions, velocities and torques, action of targets."""
+    """A dataset as the library lays it out, observation.state of positions, velocities and
+    torques, action of targets."""
     parts = [f"{j}.{end}" for end in ("pos", "vel", "torque") for j in JOINTS]
     features = {
         "observation.state": {"names": parts if names else None},
@@ -243,7 +244,7 @@ def test_targets_for_motors_need_gains(tmp_path, model, good):
     path = pace(tmp_path / "chirp.pt", good)
     with pytest.raises(RecordingError, match="'target:shoulder' is a position.*--kp"):
         load(path, model)
-    (got,) = load(path, model, Layout(gains=True))
+    (got,) = load(path, model, Layout(gains=frozenset(JOINTS)))
     np.testing.assert_allclose(got.ctrl, good[:, 1:3] + 0.1)
 
 
@@ -296,8 +297,10 @@ def test_a_column_map(tmp_path, model, good):
 
 def test_degrees_are_turned_where_they_are_angles(tmp_path, servos, good):
     slide = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><body><joint name="rail" type="slide"/><geom size=".1"/><body><joint name="pole"/><geom size=".1" '
-        'pos="0 0 1"/></body></body></worldbody><actuator><motor name="belt" joint="rail"/></actuator></mujoco>'
+        '<mujoco><worldbody><body><joint name="rail" type="slide"/><geom size=".1"/><body><joint '
+        'name="pole"/><geom size=".1" '
+        'pos="0 0 1"/></body></body></worldbody><actuator><motor name="belt" '
+        'joint="rail"/></actuator></mujoco>'
     )
     degrees = good[:50].copy()
     degrees[:, 1:5] = np.rad2deg(degrees[:, 1:5])

@@ -111,8 +111,10 @@ def test_free_ball_and_sensor_columns(tmp_path):
 
 
 def test_an_actuator_without_input_has_no_control():
-    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><actuator>
-        <dcmotor name="drag" joint="j" input="none" motorconst=".1 .1" resistance="1"/><motor name="m" joint="j"/></actuator></mujoco>""")
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="j"/><geom
+    size=".1"/></body></worldbody><actuator>
+        <dcmotor name="drag" joint="j" input="none" motorconst=".1 .1" resistance="1"/><motor
+        name="m" joint="j"/></actuator></mujoco>""")
     assert list(columns_of(model)) == ["qpos:j", "qvel:j", "ctrl:m"]
 
 
@@ -128,7 +130,8 @@ def test_sensors(tmp_path, model, good):
 
 
 class Minari(types.ModuleType):
-    """As much of the optional package as the reader uses, holding two episodes of a Hopper-like observation."""
+    """As much of the optional package as the reader uses, holding two episodes of a Hopper-like
+    observation."""
 
     def __init__(self, infos):
         super().__init__("minari")
@@ -315,8 +318,10 @@ def test_positions_that_the_model_cannot_have(model, good):
         "qpos:elbow is far outside the joint's range in the model, -2.9 to 2.9, in"
         in " | ".join(check([recording(far[:, :7])], model))
     )
-    cube = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><body pos="0 0 .1">
-        <freejoint name="cube"/><geom name="box" type="box" size=".1 .1 .1"/></body></worldbody></mujoco>""")
+    cube = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom name="floor" type="plane"
+    size="1 1 1"/><body pos="0 0 .1">
+        <freejoint name="cube"/><geom name="box" type="box" size=".1 .1
+        .1"/></body></worldbody></mujoco>""")
     t = 0.01 * np.arange(100)
     qpos = np.stack([t, 0 * t, 0.1 + 0 * t, 1 + 0 * t, 0 * t, 0 * t, 0 * t], axis=1)
     slides = Recording("slide.csv", t, qpos, np.full((100, 6), np.nan), np.zeros((100, 0)))
@@ -336,7 +341,8 @@ def test_same_warning_for_many_files_is_one_line(model, good):
         many.append(recording(table, f"run{k}.csv"))
     assert check(many, model) == [
         "run0.csv and 4 more: qpos:shoulder has nan in up to 15 % of its rows",
-        "run0.csv and 4 more: ctrl:elbow_motor is constant at 0; nothing can be said about what only it would show",
+        "run0.csv and 4 more: ctrl:elbow_motor is constant at 0; nothing can be said about what "
+        "only it would show",
     ]
 
 
@@ -426,7 +432,8 @@ def test_controls_in_another_unit(good, factor, gear, says):
 
 
 def test_a_joint_that_sticks_is_not_in_degrees(model, good):
-    """Friction that the nominal model lacks holds the elbow: no acceleration, though gravity pulls."""
+    """Friction that the nominal model lacks holds the elbow: no acceleration, though gravity
+    pulls."""
     stuck = good.copy()
     stuck[:, 2], stuck[:, 3:5] = (
         0.8 + 1e-4 * np.random.default_rng(0).normal(size=len(good)),
@@ -437,8 +444,10 @@ def test_a_joint_that_sticks_is_not_in_degrees(model, good):
     )
 
 
-BODY = """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1"><freejoint name="root"/><geom type="box" size=".1 .2 .03" mass="1"/>
-<site name="a" pos=".1 .1 0"/><site name="b" pos="-.1 0 0"/></body></worldbody><actuator><motor name="a" site="a" gear="0 0 1 0 0 0.1"/>
+BODY = """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1"><freejoint
+name="root"/><geom type="box" size=".1 .2 .03" mass="1"/>
+<site name="a" pos=".1 .1 0"/><site name="b" pos="-.1 0 0"/></body></worldbody><actuator><motor
+name="a" site="a" gear="0 0 1 0 0 0.1"/>
 <motor name="b" site="b" gear="0 0 1 0 0 -0.1"/></actuator></mujoco>"""
 
 
@@ -471,8 +480,10 @@ def test_a_free_body_in_another_convention(spoil, says):
 
 @pytest.mark.parametrize("unit", ["mm", "m"])
 def test_a_slide_in_millimetres(unit):
-    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" damping="20"/>
-        <geom size=".1" mass="10"/></body></worldbody><actuator><motor name="drive" joint="x"/></actuator></mujoco>""")
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><joint name="x" type="slide"
+    axis="1 0 0" damping="20"/>
+        <geom size=".1" mass="10"/></body></worldbody><actuator><motor name="drive"
+        joint="x"/></actuator></mujoco>""")
     data, rows = mujoco.MjData(model), []
     for k in range(800):
         data.ctrl[0] = 40 * np.sin(3 * data.time) + 20 * np.sin(7 * data.time)
@@ -491,10 +502,14 @@ def test_a_slide_in_millimetres(unit):
 
 
 def test_a_model_in_contact_is_not_accused():
-    """Resting on the floor, where the contact force is not known: no verdict on units or columns."""
-    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 .05">
-        <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size=".08 .08 .05" mass="1"/>
-        </body></worldbody><actuator><motor name="push" joint="x" gear="10"/><motor name="lift" joint="z" gear="10"/></actuator></mujoco>""")
+    """Resting on the floor, where the contact force is not known: no verdict on units or
+    columns."""
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="5 5
+    1"/><body pos="0 0 .05">
+        <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom
+        type="box" size=".08 .08 .05" mass="1"/>
+        </body></worldbody><actuator><motor name="push" joint="x" gear="10"/><motor name="lift"
+        joint="z" gear="10"/></actuator></mujoco>""")
     rng = np.random.default_rng(0)
     data, rows = mujoco.MjData(model), []
     for k in range(2000):
