@@ -13,7 +13,8 @@ PENDULUM = """<robot name="pendulum"><link name="stand"/><link name="rod"><inert
   <origin xyz="0 0 -.2"/><mass value="0.5"/>
   <inertia ixx=".004" iyy=".004" izz=".0004" ixy="0" ixz="0" iyz="0"/></inertial></link>
   <joint name="pivot" type="revolute"><parent link="stand"/><child link="rod"/><axis xyz="0 1 0"/>
-  <limit lower="-3" upper="3" effort="2" velocity="20"/><dynamics damping="0.01"/></joint></robot>"""
+  <limit lower="-3" upper="3" effort="2" velocity="20"/><dynamics damping="0.01"/></joint>
+  </robot>"""
 HIDDEN = 0.08  # N·m of Coulomb friction
 FINE = 'frictionloss="0.08" solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"'
 
