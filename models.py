@@ -9,6 +9,7 @@ All are float32 MLPs that normalise their own inputs, and need torch alone.
 """
 
 import math
+from contextlib import contextmanager
 
 import torch
 from torch import nn
@@ -18,6 +19,29 @@ DEEP, SHALLOW = (64, 64), (4,)  # hidden layers of the paper's two target polici
 LOG_2PI_E = math.log(2 * math.pi * math.e)
 
 
+@contextmanager
+def torch_threads(n):
+    """Meanwhile torch takes n threads. All numbers here are made with one: sums that several threads share round
+    otherwise, and in a rollout torch's threads would fight the simulator's pool for the cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(n)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def as_vector(network):
+    """The parameters of a network as the one vector that they become views of: (n,).
+
+    A network that was trained, one that was loaded and a copy of either lie in memory in the same way from here on:
+    products round by where their factors lie, and a run that goes on would drift from the run it was.
+    """
+    vector = parameters_to_vector(network.parameters()).detach()
+    vector_to_parameters(vector, network.parameters())
+    return vector
+
+
 class MLP(nn.Sequential):
     """Fully connected tanh layers and a linear last one; orthogonal weights, the last layer's scaled by last_gain.
 
@@ -25,6 +49,7 @@ class MLP(nn.Sequential):
     networks this small its bookkeeping takes as long as the arithmetic.
     """
 
+    @torch_threads(1)
     def __init__(self, sizes, last_gain=1.0):
         layers = []
         for i, (n_in, n_out) in enumerate(zip(sizes, sizes[1:])):
@@ -35,6 +60,7 @@ class MLP(nn.Sequential):
             layers += [layer] if last else [layer, nn.Tanh()]
         super().__init__(*layers)
         self.linear = layers[::2]
+        as_vector(self)
 
     @torch.no_grad()
     def values(self, x):
@@ -71,10 +97,16 @@ class MLP(nn.Sequential):
 
 
 def adam(net, lr):
-    """Adam on all weights of a network as the one vector that they become views of: the same numbers, bit for bit, in fewer calls."""
-    weights = nn.Parameter(parameters_to_vector(net.parameters()).detach())
-    vector_to_parameters(weights, net.parameters())
-    return torch.optim.Adam([weights], lr=lr)
+    """Adam on all weights of a network as one vector: the same numbers, bit for bit, in fewer calls."""
+    return torch.optim.Adam([nn.Parameter(as_vector(net))], lr=lr)
+
+
+def tie(optimizer, net):
+    """Make adam()'s vector the weights of net again: a copy or a conversion of either has parted them."""
+    [weights] = optimizer.param_groups[0]["params"]
+    weights.data = as_vector(net)
+    moments = optimizer.state[weights]
+    moments.update({k: v.to(weights.dtype) for k, v in moments.items() if k != "step"})
 
 
 def least_squares_step(net, optimizer, x, y):
@@ -133,6 +165,7 @@ class GaussianPolicy(nn.Module):
         self.normalizer = Normalizer(nobs)
         self.net = MLP(self.sizes, last_gain=0.01)  # starts near mean 0 everywhere
         self.log_std = nn.Parameter(torch.full((nact,), float(log_std)))
+        as_vector(self)
 
     def mean(self, obs):
         """The deterministic action, (N, nact), for obs (N, nobs)."""
@@ -244,6 +277,7 @@ class Regressor(nn.Module):
     def forward(self, x):
         return self.outputs.inverse(self.net(self.inputs(x)))
 
+    @torch_threads(1)
     def fit(self, x, y, generator, max_updates=5_000, patience=10, batch_size=256, lr=1e-3):
         """Least squares with Adam, for at most max_updates * batch_size samples; stops earlier when the held-out fifth
         has not improved for `patience` epochs.

@@ -3,8 +3,7 @@
     learner = TRPO(policy, value, TRPOConfig())
     learner.learn(env, steps=1_000_000, seed=0, on_update=print)
 
-The environment is a gymnasium VectorEnv in SAME_STEP autoreset mode that also hands out info["next_obs"],
-the true successor of every transition. Each update solves
+The environment is a gymnasium VectorEnv in SAME_STEP autoreset mode. Each update solves
 
     max_theta  E[pi_theta/pi_old * A] + entropy * H(pi_theta)   s.t.  E[KL(pi_old || pi_theta)] <= max_kl
 
@@ -13,14 +12,22 @@ line search the largest step that really keeps both promises.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from models import adam, gaussian_entropy, gaussian_kl, gaussian_log_prob, least_squares_step
+from models import (
+    adam,
+    as_vector,
+    gaussian_entropy,
+    gaussian_kl,
+    gaussian_log_prob,
+    least_squares_step,
+    tie,
+    torch_threads,
+)
 
 
 @dataclass(frozen=True)
@@ -214,17 +221,6 @@ def explained_variance(prediction, target):
 # --- the learner --------------------------------------------------------------------------------------
 
 
-@contextmanager
-def torch_threads(n):
-    """Meanwhile torch takes n threads: in a rollout its own would fight the simulator's pool for the cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(n)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 class TRPO:
     """A policy, its value function, and how they learn.
 
@@ -260,6 +256,8 @@ class TRPO:
         freeze_normalizer: keep the observation statistics as they are. on_update(stats) is called with a dict after
         every update of the policy; the value may then still be fitting, and stands still once learn returns.
         """
+        as_vector(self.policy)
+        tie(self.optimizer, self.value.net)
         self.generator.manual_seed(seed)
         obs, _ = env.reset(seed=seed)
         horizon = self.batch_steps(env) // env.num_envs
@@ -297,7 +295,7 @@ class TRPO:
                     reward,
                     terminated,
                     terminated | truncated,
-                    info["next_obs"].astype(np.float32),
+                    successors(obs, info).astype(np.float32),
                 )
             )
         names = ("obs", "action", "reward", "terminated", "done", "next_obs")
@@ -350,6 +348,16 @@ class TRPO:
         return stats, value_fit
 
 
+def successors(obs, info):
+    """Every transition's true successor (N, nobs): info["next_obs"], or what gymnasium's own SAME_STEP environments say."""
+    if "next_obs" in info:
+        return info["next_obs"]
+    after = np.array(obs)
+    for i in np.flatnonzero(info.get("_final_obs", ())):
+        after[i] = info["final_obs"][i]
+    return after
+
+
 class EpisodeReturns:
     """Mean undiscounted return of the episodes that ended in each batch."""
 
@@ -387,7 +395,7 @@ def rollouts(policy, env, episodes, seed, deterministic=False):
                 action = policy.mean(before) if deterministic else policy.act(before, generator)
                 action, before = np.clip(action.numpy(), low, high), obs
                 obs, reward, terminated, truncated, info = env.step(action)
-                after = info["next_obs"][alive].astype(np.float32)
+                after = successors(obs, info)[alive].astype(np.float32)
                 rows.append(
                     (before[alive], action[alive], after, np.flatnonzero(alive) + len(returns))
                 )
