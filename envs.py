@@ -9,6 +9,7 @@ Every environment of a batch is one row of a `mujoco.batch.Batch`, so a step is 
 Observations, rewards, ends and resets equal `gymnasium.make(id)`, seed for seed.
 """
 
+import copy
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,6 +101,7 @@ TASKS = {
 }
 ENV_IDS = [f"{name}-{version}" for name in TASKS for version in ("v4", "v5")]
 TIME_LIMIT = 1000  # steps, as registered in gymnasium for all three
+UNSTABLE = ("QPOS", "QVEL", "QACC", "CTRL")  # MuJoCo's warnings of NaN and huge values
 
 
 def task_of(env_id):
@@ -184,11 +186,13 @@ def _id_of(model, kind, change):
 
 
 def perturb(model, changes):
-    """Apply Changes to a compiled mujoco.MjModel in place. Raises EnvError for a name that it lacks.
+    """A copy of a compiled mujoco.MjModel with Changes applied. Raises EnvError for a name that it lacks.
 
     Inertia scales along with mass, and mj_setConst renews what MuJoCo derives from both. Editing the compiled
     model rather than its XML matters for HalfCheetah, whose compiler rescales every edit to a total of 14 kg.
+    A servo's gain stands in its bias too: both scale, and it still goes where it is told.
     """
+    model = copy.copy(model)
     for change in changes:
         if change.field == "mass":
             body = _id_of(model, "body", change)
@@ -214,13 +218,16 @@ def perturb(model, changes):
                     f"no actuator {change.name!r} for its gain: name its joint, one of {', '.join(joints)}"
                 )
             for i in actuators:
-                model.actuator_gainprm[i, 0] = change.of(model.actuator_gainprm[i, 0])
+                old = model.actuator_gainprm[i, 0]
+                model.actuator_biasprm[i, :3] *= change.of(old) / old if old else 1.0
+                model.actuator_gainprm[i, 0] = change.of(old)
         else:
             joint = _id_of(model, "joint", change)
             dofs = np.flatnonzero(model.dof_jntid == joint)
             field = getattr(model, JOINT_FIELDS[change.field])
             field[dofs] = [change.of(old) for old in field[dofs]]
     mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
 
 
 # --- the environment --------------------------------------------------------------------------------
@@ -236,7 +243,10 @@ class BatchEnv(VectorEnv):
       env_id: one of ENV_IDS. num_envs: copies. perturbation: Changes that make this world "real".
       model: a mujoco.MjModel to run instead of gymnasium's own: the same joints, and its actuators first.
       nthread: threads of the simulator's pool, 0 for all cores.
-    Raises EnvError: unknown id or name, num_envs < 1, or an unstable simulation (in step).
+    Where a step is unstable (NaN or huge values), as a robot thrown about by a bad policy can make it, that robot's
+    episode terminates where it last was, unpaid.
+    counterfactual_steps: how many steps were simulated from here without being taken (peek, predict).
+    Raises EnvError: unknown id or name, num_envs < 1, or (in step) every simulation unstable at once.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -253,7 +263,7 @@ class BatchEnv(VectorEnv):
             sizes = f"{self.model.nq} coordinates and {self.model.nu} actuators, {env_id} has {nominal.nq} and {nominal.nu}"
             raise EnvError(f"the given model has {sizes}: give one with the same joints")
         if perturbation:
-            perturb(self.model, perturbation)
+            self.model = perturb(self.model, perturbation)
         self.dt = nominal.opt.timestep * self.task.frame_skip
         self.frame_skip = max(
             1, round(self.dt / self.model.opt.timestep)
@@ -268,6 +278,7 @@ class BatchEnv(VectorEnv):
         self._init_qpos = self.model.qpos0.copy()
         self._rng = [None] * num_envs
         self.steps = np.zeros(num_envs, int)
+        self.counterfactual_steps = 0
 
         nobs = self.model.nq + self.model.nv - self.task.skip_root_x
         low, high = nominal.actuator_ctrlrange.astype(np.float32).T
@@ -323,13 +334,14 @@ class BatchEnv(VectorEnv):
         x_before = self.qpos[:, 0].copy()
         self._ctrl[:] = actions if applied is None else applied
         self.batch.step(nstep=self.frame_skip)
-        self._check(self.batch)
+        lost = self._unstable(self.batch)
         self.steps += 1
 
-        terminated = self.task.unhealthy(self.qpos, self.qvel)
+        terminated = self.task.unhealthy(self.qpos, self.qvel) | lost
         truncated = self.steps >= TIME_LIMIT
         reward = self._reward(actions, (self.qpos[:, 0] - x_before) / self.dt, terminated)
         next_obs = self.observe()
+        reward[lost], next_obs[lost] = 0.0, self.obs[lost]
         info = {"next_obs": next_obs}
         self.obs = next_obs
         done = terminated | truncated
@@ -357,8 +369,8 @@ class BatchEnv(VectorEnv):
         self.obs = self.observe()
         self._ctrl[:] = applied(self.obs) if callable(applied) else applied
         self.batch.step(nstep=self.frame_skip)
-        self._check(self.batch)
-        return self.observe()
+        self.counterfactual_steps += self.num_envs
+        return np.where(self._unstable(self.batch)[:, None], self.obs, self.observe())
 
     def peek(self, actions):
         """Where one step under actions would lead from the present states: the next observations; nothing moves."""
@@ -367,8 +379,9 @@ class BatchEnv(VectorEnv):
         self._peek.state[:] = self.batch.state
         self._peek.bind("ctrl")[:, : self._ctrl.shape[1]] = actions
         self._peek.step(nstep=self.frame_skip)
-        self._check(self._peek)
-        return self.task.observe(self._peek.qpos, self._peek.qvel)
+        self.counterfactual_steps += self.num_envs
+        after = self.task.observe(self._peek.qpos, self._peek.qvel)
+        return np.where(self._unstable(self._peek)[:, None], self.observe(), after)
 
     def _reward(self, actions, x_velocity, terminated):
         task = self.task
@@ -383,25 +396,17 @@ class BatchEnv(VectorEnv):
             reward -= task.ctrl_weight * np.square(actions).sum(axis=1)
         return reward
 
-    def _check(self, batch):
-        """Raise EnvError where a batch's last steps became unstable."""
+    def _unstable(self, batch):
+        """Which rows of a batch became unstable in its last steps: (N,) bool. Raises EnvError where all did."""
         if not batch.warning.any():
-            return
+            return np.zeros(self.num_envs, bool)
         # columns: last offending index, how often; a NaN control counts as unstable too
-        kinds = mujoco.mjtWarning
-        fatal = [
-            int(w)
-            for w in (
-                kinds.mjWARN_BADQPOS,
-                kinds.mjWARN_BADQVEL,
-                kinds.mjWARN_BADQACC,
-                kinds.mjWARN_BADCTRL,
-            )
-        ]
-        unstable = np.flatnonzero(batch.warning[:, fatal, 1].any(axis=1))
-        if unstable.size:
-            raise EnvError(
-                f"{self.env_id}: the simulation became unstable (NaN or huge values) in environment {unstable[0]} at step "
-                f"{self.steps[unstable[0]]}: if --real changed the model, choose a smaller change"
-            )
+        fatal = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in UNSTABLE]
+        lost = batch.warning[:, fatal, 1].any(axis=1)
         batch.warning[:] = 0
+        if lost.all():
+            raise EnvError(
+                f"{self.env_id}: the simulation became unstable (NaN or huge values) at step {self.steps[0]}, in every "
+                "environment: if --real changed the model, choose a smaller change"
+            )
+        return lost

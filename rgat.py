@@ -20,7 +20,7 @@ from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch
 
 from envs import EnvError
-from models import ForwardModel, GaussianPolicy, InverseModel, Value
+from models import ForwardModel, GaussianPolicy, InverseModel, Regressor, Value
 from trpo import TRPO, TRPOConfig, rollouts
 
 # the action transformer's own trust region, entropy and discount; section IV-D has 1e-4, 1e-5 and 0.99 (see README)
@@ -131,20 +131,17 @@ class ActionTransformerEnv(VectorEnv):
     units the fast joints are all that counts, and what makes a robot fall, its slow root, is given up for them.
     The target policy and the sim are g_phi's environment. R_AT is never positive,
     so an agent that could end episodes would learn to: the task's falls are handed out as truncations, which
-    TRPO bootstraps like time limits. Where f_psi starts from the sim's own guess of s', the reward is counted
-    from what a itself would have got, -||f_psi(s, a) - guess||^2: a baseline that g_phi does not influence.
+    TRPO bootstraps like time limits. With baseline, the reward is counted from what a itself would have got in the
+    sim, -||f_psi(s, a) - guess||^2: for gamma 0 g_phi does not influence that. With a longer sight it does, for g_phi
+    decides where the path leads, and being where the sim is wrong would pay; then a baseline is left to V.
+    seed: of pi's noise; g_phi's own must come from another.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, sim, transformer, policy, real_model, scale, seed):
-        self.sim, self.transformer, self.policy, self.real_model, self.scale = (
-            sim,
-            transformer,
-            policy,
-            real_model,
-            scale,
-        )
+    def __init__(self, sim, transformer, policy, real_model, scale, seed, baseline=False):
+        self.sim, self.transformer, self.policy = sim, transformer, policy
+        self.real_model, self.scale, self.baseline = real_model, scale, baseline
         self.num_envs = sim.num_envs
         nobs, nact = sim.single_observation_space.shape[0], sim.single_action_space.shape[0]
         self.single_observation_space = Box(-np.inf, np.inf, (nobs + nact,), np.float32)
@@ -170,9 +167,7 @@ class ActionTransformerEnv(VectorEnv):
         obs, _, terminated, truncated, info = self.sim.step(
             a, applied=self.transformer.apply(a, output)
         )
-        reward = -distance(info["next_obs"]) + (
-            distance(guess) if self.real_model.residual else 0.0
-        )
+        reward = -distance(info["next_obs"]) + (distance(guess) if self.baseline else 0.0)
         next_sa = self._with_action(info["next_obs"])
         done = terminated | truncated
         self.sa = next_sa.copy()
@@ -262,8 +257,9 @@ class RGAT(Grounding):
         # exploration is renewed: with what TRPO leaves of it, a trust region would hold g_phi where it is
         with torch.no_grad():
             self.learner.policy.log_std.fill_(np.log(self.settings.at_std))
+        baseline = self.real_model.residual and self.settings.at.gamma == 0
         env = ActionTransformerEnv(
-            self.sim, self.transformer, policy, self.real_model, self.scale, seed
+            self.sim, self.transformer, policy, self.real_model, self.scale, seed + 1, baseline
         )
         kls = []
         self.learner.learn(
@@ -359,34 +355,24 @@ class ANE(Grounding):
         return {}
 
 
-class Oracle(Grounding):
-    """The ceiling of action transformation: the delta_a that best imitates the true real model, step by step.
+class Solver(Grounding):
+    """The delta_a that best takes the sim to a target, solved for step by step instead of learnt.
 
-    A Gauss-Newton step on ||s'_sim(a_hat) - s'_real(a)||^2, in the units of R_AT, whole, halved or not at all, whichever lands
-    nearest; derivatives by finite differences in a batch, from the sim's full state. It knows the real model,
-    which no method may: it tells what a perfect g_phi could do.
+    A Gauss-Newton step on ||s'_sim(a_hat) - target||^2, in the units of R_AT, whole, halved or not at all, whichever lands
+    nearest; derivatives by finite differences in a batch, from the sim's full state.
     """
 
-    learns_from_real = True  # the units alone
     epsilon = 0.05  # finite difference, in units of the action range
 
-    def __init__(self, sim, settings=GroundingSettings(), real_model=None):
+    def __init__(self, sim, settings=GroundingSettings()):
         super().__init__(sim, settings)
         nthread = sim.batch.nthread
-        self.real_batch = Batch(real_model, sim.num_envs, nthread)
         self.probe = Batch(sim.model, sim.num_envs * (1 + self.nact), nthread)
         self.trial = Batch(sim.model, sim.num_envs * 2, nthread)
-        self.transformer = self._transform
 
-    def fit(self, tau_real, seed):
-        self._measure_scale(tau_real)
-        return {}
-
-    def state(self):
-        return {"scale": torch.from_numpy(self.scale)}
-
-    def load(self, state):
-        self.scale = state["scale"].numpy()
+    def _target(self, action):
+        """Where each simulation should be after one step under action (n, nact): (n, 1, nobs), in units of scale."""
+        raise NotImplementedError
 
     def _after(self, batch, actions):
         """Observations (n, k, nobs), in units of scale, one step after the sim's present states under actions (n, k, nact)."""
@@ -396,10 +382,11 @@ class Oracle(Grounding):
         batch.step(nstep=self.sim.task.frame_skip)
         return self.sim.task.observe(batch.qpos, batch.qvel).reshape(n, k, -1) / self.scale
 
-    def _transform(self, obs, action):
+    def solve(self, obs, action):
+        """a_hat (n, nact): the transformer."""
         span = self.high - self.low
         action = np.clip(action, self.low, self.high).astype(float)
-        target = self._after(self.real_batch, action[:, None])
+        target = self._target(action)
         # probe towards the middle, so that no probe leaves the actuator's range
         reach = self.epsilon * span * np.where(action > (self.high + self.low) / 2, -1.0, 1.0)
         probes = np.concatenate(
@@ -413,9 +400,96 @@ class Oracle(Grounding):
             normal, np.einsum("naj,nj->na", jacobian, residual[:, 0])[..., None]
         )[..., 0]
         trials = np.clip(action[:, None] + np.stack((step, step / 2), axis=1), self.low, self.high)
+        self.sim.counterfactual_steps += len(action) * (probes.shape[1] + trials.shape[1])
         errors = np.concatenate((residual, target - self._after(self.trial, trials)), axis=1)
         choices = np.concatenate((action[:, None], trials), axis=1)
         return choices[np.arange(len(action)), (errors**2).sum(axis=2).argmin(axis=1)]
+
+
+class Oracle(Solver):
+    """The ceiling of action transformation: solved towards the true real model.
+
+    It knows that model, which no method may: it tells what a perfect g_phi could do.
+    """
+
+    learns_from_real = True  # the units alone
+
+    def __init__(self, sim, settings=GroundingSettings(), real_model=None):
+        super().__init__(sim, settings)
+        self.real_batch = Batch(real_model, sim.num_envs, sim.batch.nthread)
+        self.transformer = self.solve
+
+    def fit(self, tau_real, seed):
+        self._measure_scale(tau_real)
+        return {}
+
+    def _target(self, action):
+        return self._after(self.real_batch, action[:, None])
+
+    def state(self):
+        return {"scale": torch.from_numpy(self.scale)}
+
+    def load(self, state):
+        self.scale = state["scale"].numpy()
+
+
+class Solved(Solver):
+    """RGAT's g_phi with a label instead of a reward: delta_a solved towards f_psi(s, a), then distilled into a network.
+
+    The solver needs the sim's full state and several of its steps for each one taken; the network (s, a) -> delta_a
+    that is fitted to what it said needs neither.
+    """
+
+    learns_from_real = True
+
+    def __init__(self, sim, settings=GroundingSettings()):
+        super().__init__(sim, settings)
+        self.real_model = RealModel(sim, settings.residual)
+        self.network = Regressor(self.nobs + self.nact, self.nact)
+
+    def fit(self, tau_real, seed):
+        self._measure_scale(tau_real)
+        return {"forward_model_error": relative(self.real_model.fit(tau_real, seed), tau_real)}
+
+    def _target(self, action):
+        return (self.real_model(self.sim.observe(), action)[0] / self.scale)[:, None]
+
+    def update(self, policy, steps, seed, on_update=None):
+        """Label the target policy's own (s, a) in the grounded sim, `steps` of them and whole episodes, and fit to them."""
+        labels, episodes, count = [], 0, 0
+
+        def told(obs, action):
+            a_hat = self.solve(obs, action)
+            labels.append((np.concatenate((obs, action), axis=1), a_hat - action))
+            return a_hat
+
+        solved = GroundedEnv(self.sim, told)
+        while len(labels) * self.sim.num_envs < steps:
+            count += len(rollouts(policy, solved, self.sim.num_envs, seed + episodes)[1])
+            episodes += self.sim.num_envs
+        x, y = (torch.from_numpy(np.concatenate(z).astype(np.float32)) for z in zip(*labels))
+        torch.manual_seed(seed)
+        self.network = Regressor(self.nobs + self.nact, self.nact)
+        self.network.fit(x, y, torch.Generator().manual_seed(seed))
+        self.transformer = self._transform
+        return {"sim_transitions": count}
+
+    @torch.no_grad()
+    def _transform(self, obs, action):
+        sa = torch.from_numpy(np.concatenate((obs, action), axis=1).astype(np.float32))
+        return np.clip(action + self.network(sa).numpy(), self.low, self.high)
+
+    def state(self):
+        return {
+            "network": self.network.state_dict(),
+            "forward_model": self.real_model.net.state_dict(),
+            "scale": torch.from_numpy(self.scale),
+        }
+
+    def load(self, state):
+        self.network.load_state_dict(state["network"])
+        self.real_model.net.load_state_dict(state["forward_model"])
+        self.scale, self.transformer = state["scale"].numpy(), self._transform
 
 
 METHODS = {
@@ -423,6 +497,7 @@ METHODS = {
     "gat": GAT,
     "ane": ANE,
     "oracle": Oracle,
+    "solved": Solved,
     "sim": Grounding,
     "real": Grounding,
 }
@@ -444,6 +519,7 @@ def one_step_error(env, transformer, transitions, limit=4096):
     Returns (error relative to the real step, RMS of ||a_hat - a||) over up to `limit` real transitions. Rows
     whose velocities the observation clipped are left out: their state is not known.
     """
+    counted = env.counterfactual_steps  # to measure is not to learn
     rows = np.flatnonzero(measured(env, transitions.s))
     rows = rows[np.linspace(0, len(rows) - 1, min(limit, len(rows))).astype(int)]
     miss, change = [], []
@@ -458,6 +534,7 @@ def one_step_error(env, transformer, transitions, limit=4096):
         after = env.predict(s, lambda obs: a_hat.append(transformer(obs, a)) or a_hat[0])
         miss.append((after - s_next)[: len(part)] ** 2)
         change.append(((a_hat[0] - a) ** 2).sum(axis=1)[: len(part)])
+    env.counterfactual_steps = counted
     return relative(np.sqrt(np.concatenate(miss).mean(axis=0)), transitions[rows]), float(
         np.sqrt(np.concatenate(change).mean())
     )

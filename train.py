@@ -7,194 +7,42 @@ python train.py --replay runs/pendulum
 """
 
 import argparse
+import copy
 import dataclasses
 import hashlib
 import json
 import sys
-from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import torch
 
 from diagnosis.common.atomic_files import WriteError, write_whole
 from diagnosis.common.mujoco_warnings import quiet
-from envs import BatchEnv, EnvError, model_path, parse_perturbation, perturb, task_of
-from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint
-from rgat import AT_CONFIG, METHODS, GroundedEnv, GroundingSettings, identity, one_step_error
-from training.physics_grounding import Physics
+from envs import BatchEnv, EnvError, parse_perturbation
+from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint, torch_threads
+from rgat import METHODS, RGAT, GroundedEnv, Solved, identity, one_step_error
+from training.physics_grounding import Physics, PhysicsThen
 from training.run_folder import Bar, Run, RunError, animate, save_whole, versions
-from trpo import PRESETS, TRPO, Transitions, rollouts
+from training.settings import Settings, kind_of, seed_for, settings_of
+from trpo import TRPO, Transitions, rollouts
 
-# settings that suit each task, where the command line does not say
-LARGE = dict(
-    pretrain_steps=1_000_000,
-    reference_steps=1_000_000,
-    at_steps=200_000,
-    policy_steps=250_000,
-    at_std=0.01,
-)
-DEFAULTS = {
-    "InvertedPendulum": dict(
-        grounding_steps=5,
-        pretrain_steps=80_000,
-        reference_steps=200_000,
-        at_steps=50_000,
-        policy_steps=20_000,
-        at_std=0.05,
-    ),
-    "Hopper": dict(grounding_steps=10, **LARGE),
-    "HalfCheetah": dict(grounding_steps=20, **LARGE),
+GROUNDINGS = {
+    **METHODS,
+    "physics": Physics,
+    "physics+rgat": partial(PhysicsThen, RGAT),
+    "physics+solved": partial(PhysicsThen, Solved),
 }
-
-
-UNSOUND = (
-    AttributeError,
-    IndexError,
-    KeyError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)  # what a checkpoint of something else raises
-
-
-def option(default, help, **extra):
-    return field(default=default, metadata={"help": help, **extra})
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Everything that decides a run's numbers, but for --out."""
-
-    env: str = option("Hopper-v4", "task: InvertedPendulum, Hopper or HalfCheetah, -v4 or -v5")
-    algo: str = option(
-        "rgat",
-        "how to ground: rgat, gat, ane, oracle, physics (diagnose.py); sim and real train in that world alone",
-        choices=[*METHODS, "physics"],
-    )
-    seed: int = option(0, "seed of everything random")
-    real: str = option(
-        None,
-        "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)",
-    )
-    policy: str = option(
-        "deep",
-        "hidden layers of the target policy: deep 2x64, shallow 1x4",
-        choices=["deep", "shallow"],
-    )
-    pretrain_steps: int = option(
-        None, "steps in the raw sim before the first grounding step (default: by task)"
-    )
-    reference_steps: int = option(
-        None,
-        "steps on real, from scratch, of the policy that is the reference line (default: by task, or --pretrain-steps if given)",
-    )
-    grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
-    real_trajectories: int = option(
-        None,
-        "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)",
-    )
-    at_steps: int = option(
-        None, "sim steps per grounding step for the action transformer (default: by task)"
-    )
-    policy_steps: int = option(
-        None, "grounded-sim steps per grounding step for the policy (default: by task)"
-    )
-    eval_episodes: int = option(
-        20, "real episodes per evaluation, deterministic and again stochastic"
-    )
-    num_envs: int = option(32, "simulations stepped at once")
-    at_max_kl: float = option(AT_CONFIG.max_kl, "rgat: trust region of the action transformer")
-    at_gamma: float = option(AT_CONFIG.gamma, "rgat: discount of the action transformer")
-    at_entropy: float = option(
-        AT_CONFIG.entropy, "rgat: entropy coefficient of the action transformer"
-    )
-    at_std: float = option(
-        None,
-        "rgat: its initial standard deviation, as a part of the action range (default: by task)",
-    )
-    forward_model: str = option(
-        "residual",
-        "rgat, gat: f_psi corrects the sim's own prediction, or (plain) is the paper's network of (s, a) alone",
-        choices=["residual", "plain"],
-    )
-    threads: int = option(
-        0, "cores that this run may take (default: all); seeds side by side do best with 1 each"
-    )
-    pretrained: str = option(
-        "", "folder that keeps policies trained from scratch, for other runs to share"
-    )
-    ane_width: float = option(
-        GroundingSettings.ane_width,
-        "ane: standard deviation of the action noise, as a part of half the action range",
-    )
-
-    def completed(self):
-        """These settings with the task's defaults filled in. Raises EnvError or RunError for impossible ones."""
-        task = task_of(self.env)
-        trajectories = 1 if self.algo == "physics" else 50
-        defaults = {
-            **DEFAULTS[self.env.split("-")[0]],
-            "real": task.real,
-            "real_trajectories": trajectories,
-        }
-        if self.pretrain_steps is not None:
-            defaults["reference_steps"] = self.pretrain_steps
-        done = dataclasses.replace(
-            self, **{k: v for k, v in defaults.items() if getattr(self, k) is None}
-        )
-        for name, least in COUNTS.items():
-            if getattr(done, name) < least:
-                raise RunError(
-                    f"--{name.replace('_', '-')} is {getattr(done, name)}: it must be at least {least}"
-                )
-        for name in ("at_max_kl", "at_std"):
-            if not 0 < getattr(done, name) < np.inf:
-                raise RunError(
-                    f"--{name.replace('_', '-')} is {getattr(done, name)}: it must be positive"
-                )
-        if not 0 <= done.at_gamma < 1:
-            raise RunError(f"--at-gamma is {done.at_gamma}: it must be at least 0 and below 1")
-        if not 0 <= done.ane_width < np.inf or not 0 <= done.at_entropy < np.inf:
-            raise RunError("--ane-width and --at-entropy must be 0 or more")
-        perturb(
-            mujoco.MjModel.from_xml_path(str(model_path(done.env))), parse_perturbation(done.real)
-        )  # are the names the model's?
-        return done
-
-
-COUNTS = {
-    "seed": 0, "pretrain_steps": 0, "reference_steps": 0, "grounding_steps": 0, "real_trajectories": 1, "at_steps": 1, "policy_steps": 0,
-    "eval_episodes": 1, "num_envs": 1, "threads": 0,
-}  # fmt: skip
-
-
-def seed_for(seed, step, purpose):
-    """An independent seed for each use in each grounding step, so that a resumed run draws the same numbers."""
-    purposes = (
-        "networks",
-        "pretrain",
-        "collect",
-        "model",
-        "transformer",
-        "held out",
-        "policy",
-        "evaluate",
-        "best",
-    )
-    return int(
-        np.random.SeedSequence([seed, step, purposes.index(purpose)]).generate_state(1)[0] >> 1
-    )
+UNSOUND = (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError)  # what a checkpoint of something else raises  # fmt: skip
 
 
 # --- Algorithm 1 --------------------------------------------------------------------------------------
 
 
+@torch_threads(1)
 def algorithm_1(s, run, bar):
     """Algorithm 1 of the paper under settings s. Its results are left in run; a run begun earlier goes on."""
-    if s.threads:
-        torch.set_num_threads(s.threads)
     sim = BatchEnv(s.env, s.num_envs, nthread=s.threads)
     real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=s.threads)
     learner, grounding, tau_real = start(s, run, sim, real, bar)
@@ -250,43 +98,58 @@ def update_transformer(s, grounding, policy, sim, real, seeds, log):
         "at_one_step_error": error,
         "identity_one_step_error": untouched,
         "delta_action_rms": change,
+        "real_transitions_judging": len(held_out),
     }
 
 
 def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
     """Judge the policy on real, and write down everything that the next step, or a resumed run, needs."""
     seed = seed_for(s.seed, step, "evaluate")
-    deterministic = rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)[0]
-    stochastic = rollouts(learner.policy, real, s.eval_episodes, seed)[0]
-    before = (
-        run.progress[-1] if run.progress else {"real_transitions": 0, "sim_steps": 0, "seconds": 0}
-    )
+    deterministic, seen = rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)
+    stochastic, seen_too = rollouts(learner.policy, real, s.eval_episodes, seed)
     steps, seconds = bar.lap()
     on_real = s.algo == "real"
+    extra = grounding.sim.counterfactual_steps + stats.pop("sim_transitions", 0)
+    grounding.sim.counterfactual_steps = 0
+    spent = {
+        "real_transitions": steps if on_real else len(tau_new),
+        "real_transitions_judging": stats.pop("real_transitions_judging", 0)
+        + len(seen)
+        + len(seen_too),
+        "sim_steps": 0 if on_real else steps + extra,
+        "seconds": seconds,
+    }
+    before = run.progress[-1] if run.progress else dict.fromkeys(spent, 0)
     row = {
         "grounding_step": step,
-        "real_transitions": int(before["real_transitions"]) + (steps if on_real else len(tau_new)),
-        "sim_steps": int(before["sim_steps"])
-        + (0 if on_real else steps + stats.get("sim_transitions", 0)),
+        **{name: type(n)(before[name]) + n for name, n in spent.items()},
         "real_return_deterministic": float(deterministic.mean()),
         "real_return_deterministic_se": standard_error(deterministic),
         "real_return_stochastic": float(stochastic.mean()),
         **stats,
-        "seconds": round(float(before["seconds"]) + seconds, 1),
     }
+    acting = copy.deepcopy(learner.policy).checkpoint()
+    row["rolled_back_to"] = roll_back(s, run, learner, row["real_return_deterministic"])
     transformer = grounding.state() if step else {}
     run.record(
         row,
-        {
-            "learner": learner.state(),
-            "grounding": transformer,
-            "acting": learner.policy.checkpoint(),
-        },
+        {"learner": learner.state(), "grounding": transformer, "acting": acting},
         tau_new,
     )
     bar.say(
         f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real"
     )
+
+
+def roll_back(s, run, learner, reached):
+    """The paper's "while the policy improves on real": the grounding step that the learner was put back to, or "" for none."""
+    if not s.roll_back or not run.progress:
+        return ""
+    best = run.returns()[run.best()]
+    if reached >= best - (1 - s.roll_back) * abs(best):
+        return ""
+    learner.load(run.checkpoint(run.best())["learner"])
+    return run.best()
 
 
 def standard_error(x):
@@ -298,14 +161,10 @@ def standard_error(x):
 
 def start(s, run, sim, real, bar):
     """The learner, the grounding and tau_real that the next grounding step goes on from; step 0 if there is none yet."""
-    world = real if s.algo == "real" else sim
-    method = Physics if s.algo == "physics" else METHODS[s.algo]
-    at = dataclasses.replace(AT_CONFIG, max_kl=s.at_max_kl, gamma=s.at_gamma, entropy=s.at_entropy)
-    settings = GroundingSettings(at, s.at_std, s.forward_model == "residual", ane_width=s.ane_width)
+    world, method = real if s.algo == "real" else sim, GROUNDINGS[s.algo]
     learner = new_learner(s)  # seeds torch for the grounding's networks too
-    grounding = (
-        method(world, settings, real.model) if s.algo == "oracle" else method(world, settings)
-    )
+    told = (real.model,) if s.algo == "oracle" else ()
+    grounding = method(world, s.grounding, *told)
     tau_real = nothing(real)
     done = len(run.progress) - 1
     if done >= 0:
@@ -355,22 +214,14 @@ def new_learner(s):
     env = BatchEnv(s.env, 1)
     nobs, nact = env.single_observation_space.shape[0], env.single_action_space.shape[0]
     policy = GaussianPolicy(nobs, nact, {"deep": DEEP, "shallow": SHALLOW}[s.policy])
-    return TRPO(policy, Value(nobs), PRESETS[s.env.split("-")[0]])
+    return TRPO(policy, Value(nobs), s.target)
 
 
 def pretrained(s, world, env, steps, bar):
     """TRPO from scratch in a world, "sim" or "real": the learner's state. Runs that name one --pretrained folder share it."""
-    preset = PRESETS[s.env.split("-")[0]]
-    decides = [
-        s.env,
-        s.real if world == "real" else "",
-        s.policy,
-        s.seed,
-        steps,
-        s.num_envs,
-        preset,
-        versions(),
-    ]
+    changes = s.real if world == "real" else ""
+    known = {k: v for k, v in versions().items() if k != "grounding"}
+    decides = [s.env, changes, s.policy, s.seed, steps, s.num_envs, s.threads, s.target, known]
     key = hashlib.sha256(repr(decides).encode()).hexdigest()[:16]
     folder = Path(s.pretrained) if s.pretrained else bar.run.folder
     path = folder / f"{s.env}-{world}-{key}.pt"
@@ -407,19 +258,16 @@ def pretrained(s, world, env, steps, bar):
 
 def verdict(s, run):
     """The best policy judged once more, on real episodes that did not choose it: best.json, and a line that says so."""
-    step = max(
-        range(len(run.progress)), key=lambda k: float(run.progress[k]["real_return_deterministic"])
-    )
-    policy = run.policy()
+    step, policy = run.best(), run.policy()
     real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=s.threads)
-    returns = rollouts(
-        policy, real, 2 * s.eval_episodes, seed_for(s.seed, step, "best"), deterministic=True
-    )[0]
+    seed = seed_for(s.seed, step, "best")
+    returns, seen = rollouts(policy, real, 2 * s.eval_episodes, seed, deterministic=True)
     best = {
         "grounding_step": step,
         "episodes": len(returns),
         "real_return_deterministic": float(returns.mean()),
         "se": standard_error(returns),
+        "real_transitions_judging": len(seen),
     }
     write_whole(run.folder / "best.json", json.dumps(best, indent=1))
     shown = f"{best['real_return_deterministic']:.0f} ± {best['se']:.0f} on {len(returns)} fresh episodes"
@@ -445,30 +293,6 @@ def replay(folder):
         f"{run.folder / 'replay.gif'}: "
         + ", ".join(f"{name} {value:.0f}" for name, value in returns.items())
     )
-
-
-def settings_of(folder, saved):
-    """The Settings in a run's config.json. Raises RunError where it holds something else."""
-    try:
-        s = Settings(**saved).completed()
-        values = [(f, getattr(s, f.name)) for f in dataclasses.fields(Settings)]
-        sound = all(
-            type(v) in ((float, int) if kind_of(f) is float else (kind_of(f),))
-            and v in f.metadata.get("choices", [v])
-            for f, v in values
-        )
-    except (TypeError, AttributeError):
-        sound = False
-    if not sound:
-        raise RunError(
-            f"{folder}/config.json does not hold this program's settings: start a new run"
-        )
-    return s
-
-
-def kind_of(setting):
-    """int, float or str: what a field of Settings holds."""
-    return {"int": int, "float": float, "str": str}[getattr(setting.type, "__name__", setting.type)]
 
 
 class Parser(argparse.ArgumentParser):
@@ -510,13 +334,31 @@ def parse(argv):
     given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default] + [
         "out"
     ] * (args.out is not None)
+    if args.resume:
+        given = [name for name in given if name != "grounding_steps"]
     if given and (args.resume or args.replay):
         raise RunError(
-            f"--{given[0].replace('_', '-')} cannot be changed: a run goes on in its folder with the settings it began with; leave it out"
+            f"--{given[0].replace('_', '-')} cannot be changed: a run goes on in its folder with the settings it began with "
+            "(but for more --grounding-steps); leave it out"
         )
     if args.resume and args.replay:
         raise RunError("--resume and --replay are two things to do: give one of them")
     return args
+
+
+def resumed(folder, grounding_steps=None):
+    """A run of this version and its settings, to go on to as many grounding steps (None: as it began with)."""
+    run, saved = Run.open(folder)
+    s = settings_of(folder, saved)
+    run.require_this_version()
+    if grounding_steps is not None:
+        if grounding_steps < len(run.progress) - 1:
+            raise RunError(
+                f"{folder} has done {len(run.progress) - 1} grounding steps: --grounding-steps can only add to them"
+            )
+        s = dataclasses.replace(s, grounding_steps=grounding_steps)
+        run.write_config(dataclasses.asdict(s))
+    return run, s
 
 
 def main(argv=None):
@@ -528,8 +370,7 @@ def main(argv=None):
             replay(args.replay)
             return 0
         if args.resume:
-            run, saved = Run.open(args.resume)
-            s = settings_of(args.resume, saved)
+            run, s = resumed(args.resume, args.grounding_steps)
         else:
             s = Settings(
                 **{f.name: getattr(args, f.name) for f in dataclasses.fields(Settings)}

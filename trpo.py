@@ -59,6 +59,20 @@ PRESETS = {
 }
 
 
+# the target's and the transformer's learner where the paper's own settings are asked for: stable-baselines 2's defaults
+STABLE_BASELINES = TRPOConfig(
+    batch_size=1024,
+    lam=0.98,
+    cg_steps=10,
+    cg_damping=0.01,
+    backtrack=0.5,
+    backtracks=10,
+    value_epochs=3,
+    value_lr=3e-4,
+    value_batch=128,
+)
+
+
 # --- the pieces ---------------------------------------------------------------------------------------
 
 

@@ -274,8 +274,32 @@ def test_the_papers_worlds_are_the_defaults():
 
 def test_gravity_in_units_of_downward_acceleration():
     model = mujoco.MjModel.from_xml_path(str(envs.model_path("Hopper-v4")))
-    perturb(model, parse_perturbation("world:gravity=1.62"))
-    np.testing.assert_array_equal(model.opt.gravity, [0, 0, -1.62])
+    moon = perturb(model, parse_perturbation("world:gravity=1.62"))
+    np.testing.assert_array_equal(moon.opt.gravity, [0, 0, -1.62])
+
+
+def test_the_callers_model_stays_as_it_was():
+    model = mujoco.MjModel.from_xml_path(str(envs.model_path("Hopper-v4")))
+    mass = model.body("torso").mass[0]
+    perturb(model, parse_perturbation("torso:mass*2"))
+    heavy = BatchEnv("Hopper-v4", 1, parse_perturbation("torso:mass*3"), model=model)
+    assert model.body("torso").mass[0] == mass
+    assert heavy.model.body("torso").mass[0] == 3 * mass
+
+
+def test_a_servo_of_another_gain_still_goes_where_it_is_told():
+    model = mujoco.MjModel.from_xml_string("""
+      <mujoco><option gravity="0 0 0"/><worldbody><body><joint name="hinge" damping="1"/><geom size=".1"/></body></worldbody>
+      <actuator><position joint="hinge" kp="20"/></actuator></mujoco>""")
+    strong = perturb(model, parse_perturbation("hinge:gain*3"))
+    assert strong.actuator_gainprm[0, 0] == 60
+    ends = []
+    for m in (model, strong):
+        data = mujoco.MjData(m)
+        data.ctrl[:] = 0.5
+        mujoco.mj_step(m, data, 5000)
+        ends.append(data.qpos[0])
+    np.testing.assert_allclose(ends, 0.5, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -337,6 +361,37 @@ def test_an_unstable_simulation_says_so(perturbation, action):
     with pytest.raises(EnvError, match="unstable"):
         for _ in range(50):
             env.step(np.full((2, 3), action))
+
+
+def test_an_unstable_step_ends_that_robots_episode_alone():
+    env, twin = BatchEnv("Hopper-v4", 4, nthread=1), BatchEnv("Hopper-v4", 4, nthread=1)
+    before = env.reset(seed=0)[0]
+    twin.reset(seed=0)
+    env.qvel[2] = 1e11
+    a, others = np.zeros((4, 3)), [0, 1, 3]
+    assert np.isfinite(env.peek(a)).all()
+    obs, reward, terminated, truncated, info = env.step(a)
+    np.testing.assert_array_equal(terminated, [False, False, True, False])
+    assert reward[2] == 0 and not truncated.any()
+    np.testing.assert_array_equal(info["next_obs"][2], before[2])
+    assert np.abs(obs[2] - env._init_qpos[[*range(1, 6), *[0] * 6]]).max() < 2
+    expected = twin.step(a)
+    np.testing.assert_array_equal(obs[others], expected[0][others])
+    np.testing.assert_array_equal(reward[others], expected[1][others])
+    for _ in range(5):
+        assert np.isfinite(env.step(a)[0]).all()
+    assert env.steps[2] == 5 and env.steps[0] == 6
+
+
+def test_steps_that_are_not_taken_are_counted():
+    env = BatchEnv("Hopper-v4", 4, nthread=1)
+    obs, _ = env.reset(seed=0)
+    assert env.counterfactual_steps == 0
+    env.step(np.zeros((4, 3)))
+    env.peek(np.zeros((4, 3)))
+    env.peek(np.zeros((4, 3)))
+    env.predict(obs, np.zeros((4, 3)))
+    assert env.counterfactual_steps == 12
 
 
 # --- the grounded simulator ---------------------------------------------------------------------------

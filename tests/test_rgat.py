@@ -10,6 +10,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 ROOT = str(Path(__file__).resolve().parents[1])
+import rgat
 from envs import BatchEnv, parse_perturbation, task_of
 from models import GaussianPolicy
 from rgat import (
@@ -24,12 +25,13 @@ from rgat import (
     GroundingSettings,
     Oracle,
     RealModel,
+    Solved,
     identity,
     measured,
     one_step_error,
     predict_all,
 )
-from trpo import TRPOConfig, rollouts
+from trpo import TRPO, Transitions, TRPOConfig, rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SMALL = GroundingSettings(at=replace(AT_CONFIG, batch_size=64))
@@ -63,8 +65,8 @@ class Prophet:
         return self.predicted, self.guess
 
 
-@pytest.mark.parametrize("residual", [False, True])
-def test_the_transformers_reward_by_hand(residual):
+@pytest.mark.parametrize("baseline", [False, True])
+def test_the_transformers_reward_by_hand(baseline):
     sim, twin = world("Hopper-v4"), world("Hopper-v4")
     rng = np.random.default_rng(0)
     predicted, guess = rng.normal(size=(2, 4, 11)).astype(np.float32)
@@ -72,7 +74,13 @@ def test_the_transformers_reward_by_hand(residual):
     transformer = ActionTransformer(GaussianPolicy(14, 3), low, high)
     scale = rng.uniform(0.1, 2, 11)
     env = ActionTransformerEnv(
-        sim, transformer, policy_for(sim), Prophet(predicted, guess, residual), scale, seed=3
+        sim,
+        transformer,
+        policy_for(sim),
+        Prophet(predicted, guess, True),
+        scale,
+        seed=3,
+        baseline=baseline,
     )
     assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     sa, _ = env.reset(seed=5)
@@ -90,7 +98,7 @@ def test_the_transformers_reward_by_hand(residual):
             for k in range(11):
                 expected[i] -= ((float(predicted[i, k]) - info["next_obs"][i, k]) / scale[k]) ** 2
                 expected[i] += (
-                    residual * ((float(predicted[i, k]) - float(guess[i, k])) / scale[k]) ** 2
+                    baseline * ((float(predicted[i, k]) - float(guess[i, k])) / scale[k]) ** 2
                 )
         np.testing.assert_allclose(reward, expected, rtol=1e-5, atol=1e-5)
         assert not terminated.any()  # ending an episode must never pay
@@ -248,6 +256,115 @@ def test_rgat_learns_repeats_and_reloads():
     assert np.abs(grounding.transformer(obs, a) - a).max() > 0
     other = RGAT(world("InvertedPendulum-v4"), SMALL)
     other.load(copy.deepcopy(grounding.state()))
+    np.testing.assert_array_equal(other.transformer(obs, a), grounding.transformer(obs, a))
+
+
+def spied_transformer_env(monkeypatch, **at):
+    """The ActionTransformerEnv that an update trains in, and the grounding."""
+    made, kept = [], rgat.ActionTransformerEnv
+    monkeypatch.setattr(
+        rgat, "ActionTransformerEnv", lambda *a, **k: made.append(kept(*a, **k)) or made[-1]
+    )
+    sim = world("HalfCheetah-v4", n=64)
+    tau = rollouts(policy_for(sim), sim, 1, 0)[1]
+    grounding = RGAT(sim, replace(SMALL, at=replace(SMALL.at, batch_size=1024, **at)))
+    grounding.fit(tau[:50], 0)
+    return made, grounding
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.9])
+def test_a_baseline_is_only_taken_where_g_phi_cannot_move_it(gamma, monkeypatch):
+    made, grounding = spied_transformer_env(monkeypatch, gamma=gamma)
+    grounding.update(policy_for(grounding.sim), 1, seed=5)
+    assert made[0].baseline == (gamma == 0)
+
+
+def test_the_transformers_noise_is_not_the_policys(monkeypatch):
+    made, grounding = spied_transformer_env(monkeypatch)
+    policy, seen = policy_for(grounding.sim), []
+    collect = TRPO.collect
+    monkeypatch.setattr(TRPO, "collect", lambda *a: seen.append(collect(*a)) or seen[-1])
+    grounding.update(policy, 1, seed=5)
+    obs, output = seen[0][0]["obs"].reshape(-1, 23), seen[0][0]["action"].reshape(-1, 6)
+    with torch.no_grad():
+        noise = obs[:, 17:] - policy.mean(torch.from_numpy(obs[:, :17])).numpy()
+    inside = np.abs(obs[:, 17:]).max(1) < 1
+    r = np.corrcoef(noise[inside].ravel(), (output - output.mean(0))[inside].ravel())[0, 1]
+    assert abs(r) < 0.1
+
+
+def test_a_second_update_goes_on_from_the_first_and_explores_anew():
+    sim, tau = world("InvertedPendulum-v4"), real_data("InvertedPendulum-v4", 30)
+    grounding, policy = RGAT(sim, replace(SMALL, at_std=0.05)), policy_for(sim)
+    grounding.fit(tau, 0)
+    first = grounding.update(policy, 2048, 0)
+    learnt = [p.detach().clone() for p in grounding.learner.policy.net.parameters()]
+    scale = grounding.scale.copy()
+    statistics = grounding.learner.policy.normalizer.mean.clone()
+    grounding.fit(tau[: len(tau) // 2] + tau[:3], 1)
+    np.testing.assert_array_equal(grounding.scale, scale)  # units are of the first real data
+    second = grounding.update(policy, 64, 1)
+    now = list(grounding.learner.policy.net.parameters())
+    moved = sum(float(((a - b) ** 2).sum()) for a, b in zip(learnt, now)) ** 0.5
+    whole = sum(float((a**2).sum()) for a in learnt) ** 0.5
+    assert 0 < moved < 0.2 * whole
+    assert torch.equal(statistics, grounding.learner.policy.normalizer.mean)
+    # in units of action: 5 % of the range of 6, and hardly less after a single update
+    assert first["at_std"] < 0.93 * 0.3 < second["at_std"] <= 0.31
+
+
+def test_gats_inverse_is_fitted_on_the_sims_transitions(monkeypatch):
+    sim, tau = world("InvertedPendulum-v4"), real_data("InvertedPendulum-v4", 30)
+    grounding, seen, fit = GAT(sim, SMALL), [], rgat.InverseModel.fit
+    monkeypatch.setattr(
+        rgat.InverseModel, "fit", lambda self, *a: seen.append(a) or fit(self, *a, max_updates=1)
+    )
+    grounding.fit(tau, 0)
+    grounding.update(policy_for(sim), 400, 0)
+    s, s_next, a = (x.numpy() for x in seen[0][:3])
+    after = predict_all(sim, Transitions(s, a, s_next))
+    np.testing.assert_allclose(after, s_next, atol=1e-5)
+
+
+# --- solved -------------------------------------------------------------------------------------------
+
+
+def test_solved_takes_the_sim_to_what_f_psi_says():
+    sim, oracle_sim, real = (world("InvertedPendulum-v4", real=k) for k in (False, False, True))
+    grounding, oracle = Solved(sim, SMALL), Oracle(oracle_sim, SMALL, real.model)
+
+    class Truth:
+        residual = True
+
+        def __call__(self, s, a):
+            real.batch.state[:] = sim.batch.state
+            return real.peek(a), None
+
+    tau = real_data("InvertedPendulum-v4", 30)
+    grounding.fit(tau, 0), oracle.fit(tau, 0)
+    grounding.real_model = Truth()
+    obs, _ = sim.reset(seed=0)
+    oracle_sim.reset(seed=0)
+    sim.counterfactual_steps = 0
+    a = np.array([[-2.0], [-0.5], [0.7], [2.0]])
+    np.testing.assert_allclose(grounding.solve(obs, a), oracle.transformer(obs, a), atol=1e-9)
+    assert sim.counterfactual_steps == 4 * (2 + 2)
+
+
+def test_what_was_solved_is_distilled():
+    sim, tau = world("InvertedPendulum-v4"), real_data("InvertedPendulum-v4", 30)
+    policy, grounding = policy_for(sim), Solved(sim, SMALL)
+    grounding.fit(tau, 0)
+    assert grounding.update(policy, 2000, 0)["sim_transitions"] > 1000
+    held_out = real_data("InvertedPendulum-v4", 5)
+    raw, solved, distilled = (
+        one_step_error(sim, t, held_out)[0]
+        for t in (identity, grounding.solve, grounding.transformer)
+    )
+    assert solved < 0.5 * raw and distilled < 1.3 * solved + 0.05 * raw
+    other = Solved(world("InvertedPendulum-v4"), SMALL)
+    other.load(copy.deepcopy(grounding.state()))
+    obs, a = held_out.s[:4], held_out.a[:4]
     np.testing.assert_array_equal(other.transformer(obs, a), grounding.transformer(obs, a))
 
 

@@ -1,5 +1,6 @@
 """TRPO's pieces against closed forms, plain loops and torch.distributions; the learner on environments with known answers."""
 
+import copy
 import io
 from concurrent.futures import Future
 from dataclasses import replace
@@ -8,13 +9,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import trpo
 from envs import BatchEnv
-from models import GaussianPolicy, Value
+from models import GaussianPolicy, Regressor, Value
 from trpo import (
     PRESETS,
     TRPO,
@@ -420,6 +422,127 @@ def test_a_learner_goes_on_from_its_saved_state():
         flat(learner.value), flat(other.value)
     )
     assert all(torch.equal(a, b) for a, b in zip(learner.policy.buffers(), other.policy.buffers()))
+
+
+@pytest.mark.parametrize("change", ["copied", "converted"])
+def test_a_copied_or_converted_learner_keeps_its_critic(change):
+    env, learner = new_learner("Hopper-v4", batch_size=256)
+    learner.learn(env, 512, seed=0)
+    other = copy.deepcopy(learner)
+    if change == "converted":
+        other.value.double().float(), other.policy.double().float()
+    for one in (learner, other):
+        before = flat(one.value).clone()
+        one.learn(env, 512, seed=1)
+        assert not torch.equal(before, flat(one.value))
+    for network in ("value", "policy"):
+        ours, theirs = flat(getattr(learner, network)), flat(getattr(other, network))
+        assert torch.allclose(ours, theirs, atol=1e-4)
+        assert change == "converted" or torch.equal(ours, theirs)
+
+
+def test_learners_and_fits_do_not_depend_on_torchs_threads():
+    threads, found = torch.get_num_threads(), []
+    try:
+        for n in (1, 4):
+            torch.set_num_threads(n)
+            env, learner = new_learner("Hopper-v4", batch_size=256)
+            learner.learn(env, 256, seed=0)
+            x = torch.randn(4000, 25, generator=torch.Generator().manual_seed(0))
+            model = Regressor(25, 11)
+            model.fit(x, x[:, :11].sin(), torch.Generator().manual_seed(0), max_updates=30)
+            found.append((flat(learner.policy), flat(learner.value), flat(model)))
+            assert torch.get_num_threads() == n
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(*found))
+
+
+class ChainEnv:
+    """Two states in turn, reward 1 in the first and 3 in the second, for 200 steps that a time limit cuts."""
+
+    num_envs = 4
+    single_observation_space = Box(-1, 1, (2,), np.float32)
+    single_action_space = Box(-1, 1, (1,), np.float32)
+
+    def reset(self, seed=None):
+        self.t = 0
+        return self.obs(), {}
+
+    def obs(self):
+        return np.tile(np.eye(2)[self.t % 2], (4, 1))
+
+    def step(self, action):
+        reward = np.full(4, (1.0, 3.0)[self.t % 2])
+        self.t += 1
+        after, cut = self.obs(), np.full(4, self.t % 200 == 0)
+        return self.obs(), reward, np.zeros(4, bool), cut, {"next_obs": after}
+
+
+def test_the_critic_finds_the_values_of_a_chain():
+    gamma = 0.5
+    torch.manual_seed(0)
+    config = TRPOConfig(batch_size=256, gamma=gamma, lam=0.9, value_epochs=20, value_batch=64)
+    learner = TRPO(GaussianPolicy(2, 1), Value(2), config)
+    learner.learn(ChainEnv(), 256 * 25, seed=0)
+    expected = np.linalg.solve([[1, -gamma], [-gamma, 1]], [1, 3])
+    with torch.no_grad():
+        np.testing.assert_allclose(learner.value(torch.eye(2)).numpy(), expected, rtol=0.03)
+    assert learner.value.returns.count == 256 * 25
+    assert 1 < float(learner.value.returns.mean) < 6
+
+
+def test_collect_equals_a_plain_loop_over_gymnasiums_own_environments():
+    theirs = gymnasium.vector.SyncVectorEnv(
+        [lambda: gymnasium.make("Hopper-v4", max_episode_steps=None) for _ in range(3)],
+        autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP,
+    )
+    ours = BatchEnv("Hopper-v4", 3, nthread=1)
+    _, learner = new_learner("Hopper-v4")
+    horizon, found = 80, []
+    for env in (ours, theirs):
+        learner.generator.manual_seed(1)
+        found.append(learner.collect(env, env.reset(seed=5)[0], horizon))
+    (mine, last), (stock, stock_last) = found
+    obs, _ = theirs.reset(seed=5)
+    generator = torch.Generator().manual_seed(1)
+    for t in range(horizon):
+        action = learner.policy.act(torch.from_numpy(obs.astype(np.float32)), generator).numpy()
+        before = obs
+        obs, reward, terminated, truncated, info = theirs.step(np.clip(action, -1, 1))
+        for batch in (mine, stock):
+            np.testing.assert_allclose(batch["obs"][t], before.astype(np.float32), atol=1e-6)
+            np.testing.assert_allclose(batch["action"][t], action, atol=1e-5)
+            np.testing.assert_allclose(batch["reward"][t], reward, atol=1e-6)
+            np.testing.assert_array_equal(batch["terminated"][t], terminated)
+            np.testing.assert_array_equal(batch["done"][t], terminated | truncated)
+            for i in range(3):
+                after = info["final_obs"][i] if (terminated | truncated)[i] else obs[i]
+                np.testing.assert_allclose(batch["next_obs"][t, i], after, atol=1e-5)
+    assert mine["done"].sum() > 2
+    np.testing.assert_allclose(last, stock_last, atol=1e-6)
+
+
+def test_a_line_search_takes_no_worse_surrogate():
+    """A surrogate whose best step is far shorter than the trust region allows."""
+    torch.manual_seed(0)
+    policy = GaussianPolicy(1, 1, hidden=(4,), log_std=-3.0)
+    obs = torch.randn(64, 1)
+    action = policy.mean(obs).detach() + 0.05 * torch.randn(64, 1)
+    for max_kl in (0.01, 1.0, 100.0):
+        trial = copy.deepcopy(policy)
+        config = TRPOConfig(max_kl=max_kl, backtracks=40, fisher_every=1)
+        stats = policy_update(trial, obs, action, -(action[:, 0] ** 2), config)
+        if stats["line_search"] == "accepted":
+            assert stats["surrogate_gain"] > 0 and stats["kl"] <= max_kl
+
+
+def test_the_presets_are_the_documented_ones():
+    assert (PRESETS["Hopper"].gamma, PRESETS["Hopper"].lam) == (0.995, 0.97)
+    assert PRESETS["HalfCheetah"].normalize_obs and PRESETS["HalfCheetah"].max_kl == 0.02
+    sb = trpo.STABLE_BASELINES
+    assert (sb.batch_size, sb.gamma, sb.lam, sb.max_kl, sb.cg_steps) == (1024, 0.99, 0.98, 0.01, 10)
+    assert (sb.cg_damping, sb.value_epochs, sb.value_lr, sb.value_batch) == (0.01, 3, 3e-4, 128)
 
 
 def test_observation_statistics_move_only_when_told():

@@ -72,6 +72,42 @@ class Physics(Grounding):
         self._rebuild()
 
 
+class PhysicsThen(Physics):
+    """The diagnosis corrects the model, and an action transformer takes what has no name in it.
+
+    Args: rest: the Grounding class that works on the corrected simulator, RGAT or Solved.
+    """
+
+    def __init__(self, rest, sim, settings=GroundingSettings()):
+        super().__init__(sim, settings)
+        self.rest = rest(sim, settings)
+
+    def fit(self, tau_real, seed):
+        super().fit(tau_real, seed)
+        self._rebuild()
+        return self.rest.fit(tau_real, seed)
+
+    def update(self, policy, steps, seed, on_update=None):
+        stats = self.rest.update(policy, steps, seed, on_update)
+        self.transformer = self.rest.transformer
+        return stats
+
+    def _rebuild(self):
+        """The rest goes on in the new simulator with what it has learnt."""
+        super()._rebuild()
+        learnt, learning = self.rest.state(), self.rest
+        self.rest = type(learning)(self.sim, self.settings)
+        self.rest.load(learnt)
+
+    def state(self):
+        return {**super().state(), "rest": self.rest.state()}
+
+    def load(self, state):
+        super().load(state)
+        self.rest.load(state["rest"])
+        self.transformer = self.rest.transformer
+
+
 def recordings_of(env, transitions):
     """Transitions as Recordings, one per episode. What the observation leaves out or clips counts as not measured."""
     task, nq, nv = env.task, env.model.nq, env.model.nv

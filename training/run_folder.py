@@ -3,6 +3,7 @@
 And what is seen of it meanwhile: the progress bar.
 """
 
+import ast
 import csv
 import hashlib
 import io
@@ -25,8 +26,8 @@ from diagnosis.common.atomic_files import write_table, write_whole
 from models import GaussianPolicy, load_checkpoint
 
 PROGRESS = (
-    "grounding_step real_transitions sim_steps real_return_deterministic real_return_deterministic_se "
-    "real_return_stochastic forward_model_error at_one_step_error identity_one_step_error delta_action_rms at_std kl seconds"
+    "grounding_step real_transitions real_transitions_judging sim_steps real_return_deterministic real_return_deterministic_se "
+    "real_return_stochastic forward_model_error at_one_step_error identity_one_step_error delta_action_rms at_std kl rolled_back_to seconds"
 ).split()
 ALWAYS = [k for k in PROGRESS if k.startswith("real_")] + [
     "grounding_step",
@@ -52,17 +53,32 @@ def save_whole(path, tensors):
 def versions():
     """What the numbers of a run depend on besides its settings."""
     packages = {package.__name__: package.__version__ for package in (mujoco, gymnasium, torch, np)}
-    sources = b"".join(
-        (Path(__file__).parents[1] / f"{name}.py").read_bytes()
-        for name in ("envs", "models", "trpo")
-    )
     machine = f"{platform.machine()}, {os.cpu_count()} cores"
     return {
         "python": platform.python_version(),
         **packages,
         "machine": machine,
-        "learner": hashlib.sha256(sources).hexdigest()[:16],
+        "learner": code_version("envs", "models", "trpo"),
+        "grounding": code_version("rgat", "train", "training/physics_grounding"),
     }
+
+
+def code_version(*modules):
+    """A hash of what modules do: their code without comments, layout and docstrings."""
+    digest = hashlib.sha256()
+    for name in modules:
+        tree = ast.parse((Path(__file__).parents[1] / f"{name}.py").read_bytes())
+        for node in ast.walk(tree):
+            if hasattr(node, "body") and isinstance(node.body, list):
+                node.body = [x for x in node.body if not is_text(x)]
+        digest.update(ast.dump(tree).encode())
+    return digest.hexdigest()[:16]
+
+
+def is_text(node):
+    """Whether a statement is a bare string: a docstring."""
+    value = getattr(node, "value", None)
+    return isinstance(node, ast.Expr) and isinstance(getattr(value, "value", None), str)
 
 
 class Run:
@@ -93,11 +109,24 @@ class Run:
             raise RunError(
                 f"cannot make the folder {folder}: {error.strerror}; choose another --out"
             ) from None
-        write_whole(
-            run.folder / "config.json",
-            json.dumps({"settings": settings, "versions": versions()}, indent=1),
-        )
+        run.versions = versions()
+        run.write_config(settings)
         return run
+
+    def write_config(self, settings):
+        """config.json: the settings (a dict), and the versions that the run began with."""
+        config = {"settings": settings, "versions": self.versions}
+        write_whole(self.folder / "config.json", json.dumps(config, indent=1))
+
+    def require_this_version(self):
+        """Raises RunError if the run was begun with other code or packages: its numbers would be of two kinds."""
+        for name, now in versions().items():
+            then = self.versions.get(name)
+            if name not in ("machine", "python") and then != now:
+                raise RunError(
+                    f"{self.folder} was begun by another version ({name} {then}, this is {now}): "
+                    "go on with that version, or start a new run"
+                )
 
     @classmethod
     def open(cls, folder):
@@ -105,7 +134,7 @@ class Run:
         run = cls(folder)
         try:
             config = json.loads((run.folder / "config.json").read_text())
-            settings = config["settings"]
+            settings, run.versions = config["settings"], dict(config["versions"])
             run.progress = run._read("progress.csv")
             for row in run.progress:
                 [float(row[k]) for k in ALWAYS]
@@ -147,13 +176,20 @@ class Run:
             np.savez(data, s=real.s, a=real.a, s_next=real.s_next)
             write_whole(self.folder / f"real_{step:02d}.npz", data.getvalue())
         save_whole(self.folder / f"step_{step:02d}.pt", checkpoint)
-        best = max([float(r["real_return_deterministic"]) for r in self.progress], default=-np.inf)
-        if row["real_return_deterministic"] > best:
+        if row["real_return_deterministic"] > max(self.returns(), default=-np.inf):
             save_whole(self.folder / "policy.pt", checkpoint["acting"])
         self.progress.append({k: row.get(k, "") for k in PROGRESS})
         write_table(self.folder / "train.csv", TRAIN, self.train)
         write_table(self.folder / "progress.csv", PROGRESS, self.progress)
         self.plot()
+
+    def returns(self):
+        """The deterministic return on real after every grounding step."""
+        return [float(row["real_return_deterministic"]) for row in self.progress]
+
+    def best(self):
+        """The grounding step whose policy returned most."""
+        return int(np.argmax(self.returns()))
 
     def checkpoint(self, step):
         """What record() saved for a step. Raises RunError if it is missing or damaged."""
@@ -237,7 +273,7 @@ class Bar:
     def __init__(self, s, run):
         self.run, self.seen, self.drawn, self.clock = run, 0, time.monotonic(), time.monotonic()
         self.world = "real" if s.algo == "real" else "sim"
-        at_steps = s.at_steps * (s.algo == "rgat")
+        at_steps = s.at_steps * s.algo.endswith("rgat")
         total = (
             s.pretrain_steps
             + s.reference_steps * (s.algo != "real")

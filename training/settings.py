@@ -1,0 +1,246 @@
+"""What decides a run's numbers: the settings of the command line, the presets that fill them in, and the seeds."""
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from envs import model_path, parse_perturbation, perturb, task_of
+from rgat import AT_CONFIG, METHODS, GroundingSettings
+from training.run_folder import RunError
+from trpo import PRESETS, STABLE_BASELINES
+
+ALGOS = [*METHODS, "physics", "physics+rgat", "physics+solved"]
+
+# settings that suit each task, where the command line does not say
+LARGE = dict(
+    pretrain_steps=1_000_000,
+    reference_steps=1_000_000,
+    at_steps=200_000,
+    policy_steps=250_000,
+)
+DEFAULTS = {
+    "InvertedPendulum": dict(
+        grounding_steps=5,
+        pretrain_steps=80_000,
+        reference_steps=200_000,
+        at_steps=50_000,
+        policy_steps=20_000,
+    ),
+    "Hopper": dict(grounding_steps=10, **LARGE),
+    "HalfCheetah": dict(grounding_steps=20, **LARGE),
+}
+
+# "tuned": what was found to work here; "paper": Algorithm 1 as printed, and where the paper is silent stable-baselines'
+# defaults, whose policies begin with a standard deviation of 1 in the action's own unit
+PRESET = {
+    "tuned": dict(
+        forward_model="residual",
+        at_norm="step",
+        at_max_kl=AT_CONFIG.max_kl,
+        at_gamma=AT_CONFIG.gamma,
+        at_entropy=AT_CONFIG.entropy,
+        at_std={"InvertedPendulum": 0.05, "Hopper": 0.01, "HalfCheetah": 0.01},
+    ),
+    "paper": dict(
+        forward_model="plain",
+        at_norm="raw",
+        at_max_kl=1e-4,
+        at_gamma=0.99,
+        at_entropy=1e-5,
+        at_std={"InvertedPendulum": 1 / 6, "Hopper": 1 / 2, "HalfCheetah": 1 / 2},
+    ),
+}
+
+
+def option(default, help, **extra):
+    return field(default=default, metadata={"help": help, **extra})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that decides a run's numbers, but for --out."""
+
+    env: str = option("Hopper-v4", "task: InvertedPendulum, Hopper or HalfCheetah, -v4 or -v5")
+    algo: str = option(
+        "rgat",
+        "how to ground: rgat, gat, ane, oracle, solved (rgat's transformer with a label instead of a reward), "
+        "physics (diagnose.py), and physics+rgat or physics+solved for what has no name; "
+        "sim and real train in that world alone",
+        choices=ALGOS,
+    )
+    preset: str = option(
+        "tuned",
+        "what fills in the settings left open: tuned, or paper (Algorithm 1 as printed, stable-baselines' TRPO)",
+        choices=list(PRESET),
+    )
+    seed: int = option(0, "seed of everything random")
+    real: str = option(
+        None,
+        "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)",
+    )
+    policy: str = option(
+        "deep",
+        "hidden layers of the target policy: deep 2x64, shallow 1x4",
+        choices=["deep", "shallow"],
+    )
+    pretrain_steps: int = option(
+        None, "steps in the raw sim before the first grounding step (default: by task)"
+    )
+    reference_steps: int = option(
+        None,
+        "steps on real, from scratch, of the policy that is the reference line (default: by task, or --pretrain-steps if given)",
+    )
+    grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
+    real_trajectories: int = option(
+        None,
+        "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)",
+    )
+    at_steps: int = option(
+        None, "sim steps per grounding step for the action transformer (default: by task)"
+    )
+    policy_steps: int = option(
+        None, "grounded-sim steps per grounding step for the policy (default: by task)"
+    )
+    eval_episodes: int = option(
+        20, "real episodes per evaluation, deterministic and again stochastic"
+    )
+    roll_back: float = option(
+        0.0,
+        "go on from the best policy so far where the return on real falls below this part of the best (0: never)",
+    )
+    num_envs: int = option(32, "simulations stepped at once")
+    at_max_kl: float = option(
+        None, "rgat: trust region of the action transformer (default: by preset)"
+    )
+    at_gamma: float = option(None, "rgat: discount of the action transformer (default: by preset)")
+    at_entropy: float = option(
+        None, "rgat: entropy coefficient of the action transformer (default: by preset)"
+    )
+    at_std: float = option(
+        None,
+        "rgat: its initial standard deviation, as a part of the action range (default: by preset and task)",
+    )
+    at_norm: str = option(
+        None,
+        "rgat, oracle, solved: R_AT in units of each dimension's change in a real step, or raw (default: by preset)",
+        choices=["step", "raw"],
+    )
+    forward_model: str = option(
+        None,
+        "rgat, gat, solved: f_psi corrects the sim's own prediction (residual), or (plain) is the paper's network of "
+        "(s, a) alone (default: by preset)",
+        choices=["residual", "plain"],
+    )
+    threads: int = option(
+        0,
+        "cores for the simulations (default: all); they change no number: seeds side by side do best with 1 each",
+    )
+    pretrained: str = option(
+        "", "folder that keeps policies trained from scratch, for other runs to share"
+    )
+    ane_width: float = option(
+        GroundingSettings.ane_width,
+        "ane: standard deviation of the action noise, as a part of half the action range",
+    )
+
+    @property
+    def task(self):
+        return self.env.split("-")[0]
+
+    def completed(self):
+        """These settings with the preset's and the task's defaults filled in. Raises EnvError or RunError for impossible ones."""
+        real, preset = task_of(self.env).real, PRESET[self.preset]
+        defaults = {
+            **DEFAULTS[self.task],
+            **preset,
+            "at_std": preset["at_std"][self.task],
+            "real": real,
+            "real_trajectories": 1 if self.algo.startswith("physics") else 50,
+        }
+        if self.pretrain_steps is not None:
+            defaults["reference_steps"] = self.pretrain_steps
+        done = dataclasses.replace(
+            self, **{k: v for k, v in defaults.items() if getattr(self, k) is None}
+        )
+        done.check()
+        return done
+
+    def check(self):
+        """Raises EnvError or RunError for settings that no run can have."""
+        for name, least in COUNTS.items():
+            value, shown = getattr(self, name), name.replace("_", "-")
+            if value < least:
+                raise RunError(f"--{shown} is {value}: it must be at least {least}")
+        for name in ("at_max_kl", "at_std"):
+            value, shown = getattr(self, name), name.replace("_", "-")
+            if not 0 < value < np.inf:
+                raise RunError(f"--{shown} is {value}: it must be positive")
+        if not 0 <= self.at_gamma < 1:
+            raise RunError(f"--at-gamma is {self.at_gamma}: it must be at least 0 and below 1")
+        if not 0 <= self.roll_back <= 1:
+            raise RunError(f"--roll-back is {self.roll_back}: it must be between 0 and 1")
+        if not 0 <= self.ane_width < np.inf or not 0 <= self.at_entropy < np.inf:
+            raise RunError("--ane-width and --at-entropy must be 0 or more")
+        model = mujoco.MjModel.from_xml_path(str(model_path(self.env)))
+        perturb(model, parse_perturbation(self.real))  # are the names the model's?
+
+    @property
+    def grounding(self):
+        """What the grounding methods are told: GroundingSettings."""
+        at = STABLE_BASELINES if self.preset == "paper" else AT_CONFIG
+        at = dataclasses.replace(
+            at, max_kl=self.at_max_kl, gamma=self.at_gamma, entropy=self.at_entropy
+        )
+        return GroundingSettings(
+            at,
+            self.at_std,
+            residual=self.forward_model == "residual",
+            per_step=self.at_norm == "step",
+            ane_width=self.ane_width,
+        )
+
+    @property
+    def target(self):
+        """TRPOConfig of the target policy."""
+        return STABLE_BASELINES if self.preset == "paper" else PRESETS[self.task]
+
+
+COUNTS = {
+    "seed": 0, "pretrain_steps": 0, "reference_steps": 0, "grounding_steps": 0, "real_trajectories": 1, "at_steps": 1, "policy_steps": 0,
+    "eval_episodes": 1, "num_envs": 1, "threads": 0,
+}  # fmt: skip
+
+
+def settings_of(folder, saved):
+    """The Settings in a run's config.json. Raises RunError where it holds something else."""
+    try:
+        s = Settings(**saved).completed()
+        values = [(f, getattr(s, f.name)) for f in dataclasses.fields(Settings)]
+        sound = all(
+            type(v) in ((float, int) if kind_of(f) is float else (kind_of(f),))
+            and v in f.metadata.get("choices", [v])
+            for f, v in values
+        )
+    except (TypeError, AttributeError, KeyError):
+        sound = False
+    if not sound:
+        raise RunError(
+            f"{folder}/config.json does not hold this program's settings: start a new run"
+        )
+    return s
+
+
+def kind_of(setting):
+    """int, float or str: what a field of Settings holds."""
+    return {"int": int, "float": float, "str": str}[getattr(setting.type, "__name__", setting.type)]
+
+
+PURPOSES = ("networks", "pretrain", "collect", "model", "transformer", "held out", "policy", "evaluate", "best")  # fmt: skip
+
+
+def seed_for(seed, step, purpose):
+    """An independent seed for each use in each grounding step, so that a resumed run draws the same numbers."""
+    entropy = np.random.SeedSequence([seed, step, PURPOSES.index(purpose)])
+    return int(entropy.generate_state(1)[0] >> 1)
