@@ -1,6 +1,6 @@
-"""Where the force is missing: the courses in `missing_force` of diagnosis.json, made ready to draw.
+"""Where the force is missing: what was located before any name was looked for, made ready to draw.
 
-    for joint in joints(summary):
+    for joint in joints(diagnosis):
         joint.pictures()
 
 A course is what one joint lacked in one recording: force and its standard deviation over time,
@@ -39,12 +39,14 @@ class Course:
 @dataclass(frozen=True)
 class Joint:
     """All courses of one joint, and what its force may depend on: {"velocity:elbow": (n,), ...},
-    of all courses in a row, with their units."""
+    of all courses in a row, with their units. depends_on: what the diagnosis says of that, if
+    anything."""
 
     name: str
     courses: tuple
     variables: dict
     units: dict
+    depends_on: tuple = ()
 
     @property
     def force(self):
@@ -69,7 +71,11 @@ class Joint:
         return self.certain > MISSING
 
     def best(self):
-        """(variable, share of the variance that goes with it), of the one that explains most."""
+        """(variable, share of the variance that goes with it), of the one that the diagnosis names,
+        or else that explains most."""
+        named = [name for name in self.depends_on if name in self.variables]
+        if named:
+            return named[0], explained(self.variables[named[0]], self.force)
         shares = {name: explained(x, self.force) for name, x in self.variables.items()}
         most = max(shares.values())
         return next((name, share) for name, share in shares.items() if share >= most - ALIKE)
@@ -109,9 +115,10 @@ class Joint:
         return loudest.recording, drawn, over_best
 
 
-def courses(summary):
-    """The courses in a diagnosis' summary; none where it has no list of them."""
-    records = summary.get("missing_force")
+def courses(diagnosis):
+    """The courses of a diagnosis, from `located` or from the list in its summary; none where it has
+    neither."""
+    records = getattr(diagnosis, "located", None) or diagnosis.summary.get("missing_force")
     arrays = ("time", "force", "sd", "position", "velocity")
     return [
         Course(r["joint"], r["recording"], r["unit"], *(np.array(r[k], float) for k in arrays))
@@ -120,16 +127,19 @@ def courses(summary):
     ]
 
 
-def joints(summary):
+def joints(diagnosis):
     """Joint for each that has a course, first where the missing force is most certain."""
-    grouped = {}
-    for course in courses(summary):
+    grouped, units, told = {}, {}, diagnosis.summary.get("missing_force")
+    for course in courses(diagnosis):
         grouped.setdefault(course.joint, []).append(course)
-    units = {}
     for name, (course, *_) in grouped.items():
         length = "rad" if "m" in course.unit else "m"  # N·m acts on an angle, N on a length
         units |= {f"position:{name}": length, f"velocity:{name}": f"{length}/s"}
-    found = [Joint(n, tuple(s), _variables(s, grouped), units) for n, s in grouped.items()]
+    found = []
+    for name, some in grouped.items():
+        entry = (told.get(name) if isinstance(told, dict) else None) or {}
+        asked = tuple(entry.get("depends_on") or ())
+        found.append(Joint(name, tuple(some), _variables(some, grouped), units, asked))
     return sorted(found, key=lambda joint: -joint.certain)
 
 

@@ -71,7 +71,7 @@ def _head(summary, title):
 def _missing_force(diagnosis):
     """The force that the nominal model lacks, joint by joint; None where nothing tells it."""
     shown, more = [], []
-    for joint in force.joints(diagnosis.summary):
+    for joint in force.joints(diagnosis):
         recording, over_time, over_best = joint.pictures()
         drawn = shown if joint.missing and len(shown) < FORCES else more
         drawn.append(

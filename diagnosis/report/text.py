@@ -292,7 +292,10 @@ def unexplained_words(summary):
 def verdict_words(summary):
     """The first line of everything."""
     if summary["verdict"] == "unresolved":
-        nearest = "; the nearest names are these." if summary["findings"] else "."
+        effects = {finding["effect"] for finding in summary["findings"]}
+        if effects == {"unknown"}:
+            return "Something is missing, and the catalogue has no name for it."
+        nearest = "; the nearest names are these." if effects else "."
         return f"Something is missing, and no name explains it well enough{nearest}"
     if summary["verdict"] == "match":
         if ((summary.get("unexplained") or {}).get("fraction") or 0) > MUCH:
@@ -332,7 +335,8 @@ def doubts(finding):
     """What speaks against the name of a finding, a few words each."""
     found = []
     if finding.get("adequate") is False:
-        found.append("the nearest name only: the rest of its force depends on something still")
+        on = depends_words(finding.get("rest_depends_on")) or "something"
+        found.append(f"the nearest name only: the rest of its force depends on {on} still")
     if finding.get("strains"):
         found.append(f"hard to believe: {finding['strains']}")
     constancy = finding.get("constancy")

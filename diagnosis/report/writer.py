@@ -1,7 +1,9 @@
 """The three files of a diagnosis: diagnosis.json to compute with, corrected.xml to simulate with,
 report.html to look at (sections)."""
 
+import csv
 import html
+import io
 import itertools
 import json
 import math
@@ -12,6 +14,7 @@ import numpy as np
 
 from diagnosis.common.atomic_files import WriteError, write_together
 from diagnosis.report.cards import unknown_curves
+from diagnosis.report.force import courses
 from diagnosis.report.sections import html_page, reads_files
 
 
@@ -36,28 +39,41 @@ def check_folder(out):
 
 
 def write(diagnosis, out):
-    """Write report.html, diagnosis.json, corrected.xml and a curve for each unknown force into
-    folder `out`; their names.
+    """Write the report into folder `out`; the names of its files.
 
-    A curve is unknown_<n>.csv, the first n that is free, and named in its finding as `saved_as`;
-    those of the earlier diagnosis in the folder go. All are complete under temporary names before
-    the first takes its own. Raises ReportError where that fails; what was in the folder before is
-    then unchanged.
+    report.html, diagnosis.json, corrected.xml, where needed corrected.py, a curve for each unknown
+    force, named in its finding as `saved_as`, and one for each joint's missing force, named there
+    as `curve`. A curve takes a name that is free; files of the earlier diagnosis in the folder go.
+    All are complete under temporary names before the first takes its own. Raises ReportError where
+    that fails; what was in the folder before is then unchanged.
     """
     summary, earlier = plain(diagnosis.summary), _earlier(out)
-    names = (f"unknown_{n}.csv" for n in itertools.count(1))
-    free = (
-        name for name in names if name in earlier or not os.path.lexists(os.path.join(out, name))
-    )
-    saved = {name: curve for name, curve in zip(free, unknown_curves(diagnosis))}
-    for name, curve in saved.items():
+    free = _names(out, earlier)
+    curves = {}
+    for curve in unknown_curves(diagnosis):
+        name = free("unknown_1.csv")
+        curves[name] = _csv(curve)
         summary["findings"][curve["finding"]]["saved_as"] = name
+    for joint, some in _by_joint(courses(diagnosis)).items():
+        entry = summary["missing_force"]
+        if isinstance(entry, dict) and joint in entry:
+            name = free(f"force_{re.sub(r'[^A-Za-z0-9_.-]', '_', joint)}.csv")
+            curves[name] = _course_table(some)
+            entry[joint]["curve"] = name
     files = {
         "report.html": html_page(diagnosis),
         "diagnosis.json": json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n",
         "corrected.xml": portable(diagnosis.corrected_xml, out),
-        **{name: _csv(curve) for name, curve in saved.items()},
     }
+    if script := getattr(diagnosis, "corrected_py", ""):
+        files["corrected.py"] = script
+    files |= curves
+    _replace(out, files, earlier)
+    return list(files)
+
+
+def _replace(out, files, earlier):
+    """Write {name: text} into folder `out`, together, and remove the others of `earlier`."""
     made = not os.path.isdir(out)
     try:
         os.makedirs(out, exist_ok=True)
@@ -68,7 +84,39 @@ def write(diagnosis, out):
         if made and os.path.isdir(out) and not os.listdir(out):
             os.rmdir(out)
         raise ReportError(f"the report is not written: {error}") from None
-    return list(files)
+
+
+def _names(out, earlier):
+    """A function that gives a name no other file of the folder has: the one it is asked for, or
+    the same with the next number that is free."""
+    taken = set()
+
+    def free(name):
+        stem, number = re.fullmatch(r"(.*?)(?:_(\d+))?\.csv", name).groups()
+        others = (f"{stem}_{n}.csv" for n in itertools.count(int(number or 1) + 1))
+        for candidate in itertools.chain([name], others):
+            path = os.path.join(out, candidate)
+            if candidate not in taken and (candidate in earlier or not os.path.lexists(path)):
+                taken.add(candidate)
+                return candidate
+
+    return free
+
+
+def _by_joint(courses):
+    """{joint: its courses}, in their order."""
+    return {c.joint: [other for other in courses if other.joint == c.joint] for c in courses}
+
+
+def _course_table(courses):
+    """The missing force of one joint as CSV, its recordings one after the other."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(("recording", "time", "force", "sd", "position", "velocity"))
+    for c in courses:
+        for values in zip(c.time, c.force, c.sd, c.position, c.velocity):
+            rows.writerow((c.recording, *(f"{v:.9g}" if math.isfinite(v) else "" for v in values)))
+    return text.getvalue()
 
 
 def portable(xml, out):
@@ -96,17 +144,20 @@ def portable(xml, out):
 
 
 def _earlier(out):
-    """The curves in folder `out` that an earlier diagnosis there says are its own."""
+    """The files in folder `out`, besides the three, that an earlier diagnosis says are its own."""
     try:
         with open(os.path.join(out, "diagnosis.json"), encoding="utf-8") as stream:
-            names = {str(finding.get("saved_as")) for finding in json.load(stream)["findings"]}
+            summary = json.load(stream)
+        findings, force = summary["findings"], summary.get("missing_force")
+        names = {str(finding.get("saved_as")) for finding in findings}
+        if isinstance(force, dict):
+            names |= {str(joint.get("curve")) for joint in force.values()}
+        if any(finding.get("written_as") == "python" for finding in findings):
+            names.add("corrected.py")
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return set()
-    return {
-        name
-        for name in names
-        if re.fullmatch(r"unknown_\d+\.csv", name) and os.path.isfile(os.path.join(out, name))
-    }
+    ours = re.compile(r"unknown_\d+\.csv|force_[A-Za-z0-9_.-]+\.csv|corrected\.py")
+    return {n for n in names if ours.fullmatch(n) and os.path.isfile(os.path.join(out, n))}
 
 
 def _csv(curve):

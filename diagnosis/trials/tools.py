@@ -15,8 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+FRONT = ROOT / "diagnose.py"  # of a clone; where the package is installed there is none
 DIAGNOSE = (
-    f"{{python}} {ROOT / 'diagnose.py'} --model {{model}} --recordings {{recordings}} --out {{out}}"
+    f"{{python}} {FRONT if FRONT.exists() else '-m diagnosis'} "
+    "--model {model} --recordings {recordings} --out {out}"
 )
 
 

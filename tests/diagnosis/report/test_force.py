@@ -1,10 +1,14 @@
 """The missing force on the page: which variable it is drawn over, how sure it is, what is said."""
 
+import csv
+import json
+import types
+
 import numpy as np
 import pytest
 from report_example import example
 
-from diagnosis.report import force, sections, text
+from diagnosis.report import force, sections, text, writer
 
 
 @pytest.fixture
@@ -34,7 +38,7 @@ def courses(function, seed=0, rows=400, sd=0.05):
                 "velocity": list(velocity),
             }
         )
-    return {"missing_force": made}
+    return types.SimpleNamespace(summary={"missing_force": made})
 
 
 @pytest.mark.parametrize(
@@ -81,11 +85,11 @@ def test_means_come_with_their_standard_errors():
 
 
 def test_unknown_moments_are_left_out():
-    summary = courses(lambda p, v, w, t: np.sign(v))
-    course = summary["missing_force"][0]
+    located = courses(lambda p, v, w, t: np.sign(v))
+    course = located.summary["missing_force"][0]
     course["force"][50:100] = [None] * 50
     course["velocity"][10:20] = [None] * 10
-    joint = force.joints(summary)[0]
+    joint = force.joints(located)[0]
     assert joint.best()[0] == "velocity:a" and np.isfinite(joint.rms)
     _, over_time, _ = joint.pictures()
     assert over_time.count("M") > 2 and "nan" not in over_time
@@ -98,6 +102,39 @@ def test_the_page_begins_with_it(diagnosis):
     assert first.index("<h3>elbow</h3>") < first.index("<h3>shoulder</h3>")  # the surer one first
     del diagnosis.summary["missing_force"]
     assert "Where the force is missing" not in sections.html_page(diagnosis)
+
+
+def test_the_variable_that_the_diagnosis_names_is_drawn():
+    located = courses(lambda p, v, w, t: np.sign(v))
+    located.located = located.summary["missing_force"]
+    located.summary["missing_force"] = {"a": {"depends_on": ["position:a"]}, "b": {}}
+    joint = force.joints(located)[0]
+    assert joint.best()[0] == "position:a"
+
+
+def test_each_joint_has_its_file(diagnosis, tmp_path):
+    """With the numbers that are drawn; the next diagnosis takes what it does not write away."""
+    diagnosis.located = diagnosis.summary["missing_force"]
+    entry = {"rms": 0.1, "unit": "N·m", "after": 0.0, "depends_on": []}
+    diagnosis.summary["missing_force"] = {"elbow": dict(entry), "shoulder": dict(entry)}
+    diagnosis.corrected_py = "print('here')"
+    diagnosis.summary["findings"][2]["written_as"] = "python"
+    (tmp_path / "force_elbow.csv").write_text("a user's own")
+    names = writer.write(diagnosis, tmp_path)
+    assert {"force_elbow_2.csv", "force_shoulder.csv", "corrected.py"} <= set(names)
+    summary = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
+    assert summary["missing_force"]["elbow"]["curve"] == "force_elbow_2.csv"
+    with open(tmp_path / "force_elbow_2.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    own = [c for c in diagnosis.located if c["joint"] == "elbow"]
+    expected = np.concatenate([c["force"] for c in own])
+    np.testing.assert_allclose([float(row["force"]) for row in rows], expected, rtol=1e-8)
+    assert {row["recording"] for row in rows} == {c["recording"] for c in own}
+    del diagnosis.summary["missing_force"]
+    diagnosis.located, diagnosis.corrected_py = [], ""
+    writer.write(diagnosis, tmp_path)
+    left = {"force_elbow.csv", "unknown_1.csv", "report.html", "diagnosis.json", "corrected.xml"}
+    assert {path.name for path in tmp_path.iterdir()} == left
 
 
 def test_a_summary_for_each_joint_is_a_table(diagnosis):
