@@ -14,9 +14,9 @@ from diagnosis.effects.base import (
     SLIDE,
     Effect,
     Parameter,
+    Part,
     catalogue,
-    constant_force,
-    explicit_inertia,
+    end_of_step,
     runge_kutta,
 )
 
@@ -78,13 +78,56 @@ class ActuatorEffect(Effect):
         return actuator
 
 
+def actuator_force(models, a):
+    """Function (qpos (S,nq), qvel (S,nv), ctrl (S,nu)) -> (S,) force of actuator a on a joint.
+
+    clip((g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇) to its range, l the length gear · q.
+    """
+    model = models[0]
+    joint, u = model.actuator_trnid[a, 0], model.actuator_ctrladr[a]
+    q, d, gear = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.actuator_gear[a, 0]
+    gain, bias = (
+        np.array([getattr(m, f"actuator_{f}prm")[a, :3] for m in models]).T
+        for f in ("gain", "bias")
+    )
+    gain[1:] *= model.actuator_gaintype[a] == int(mujoco.mjtGain.mjGAIN_AFFINE)
+    bias *= model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    free = -np.inf, np.inf
+    low, high = np.array(
+        [m.actuator_forcerange[a] if m.actuator_forcelimited[a] else free for m in models]
+    ).T
+
+    def force(qpos, qvel, ctrl):
+        at = np.stack([np.ones(len(qpos)), gear * qpos[:, q], gear * qvel[:, d]])
+        return np.clip((gain * at).sum(axis=0) * ctrl[:, u] + (bias * at).sum(axis=0), low, high)
+
+    return force
+
+
+def lost(models, a, change):
+    """Function as of Effect.force: what change(force, speed, time) adds to the force of actuator a.
+
+    force, speed (S,) of the actuator; the result acts on its joint.
+    """
+    model, force = models[0], actuator_force(models, a)
+    d, gear = model.jnt_dofadr[model.actuator_trnid[a, 0]], model.actuator_gear[a, 0]
+
+    def function(qpos, qvel, ctrl, time):
+        out = np.zeros_like(qvel)
+        out[:, d] = gear * change(force(qpos, qvel, ctrl), gear * qvel[:, d], time)
+        return out
+
+    return function
+
+
 def refine(spec, longest):
     """Divide the spec's time step so that it is no longer than `longest`."""
     spec.option.timestep /= max(1, np.ceil(spec.option.timestep / longest - 1e-9))
 
 
 def set_lag(actuator, seconds, model):
-    """Give a spec's actuator a first-order lag: as of the end of a step, or continuous where the integrator is."""
+    """Give a spec's actuator a first-order lag: as of the end of a step, or continuous where the
+    integrator is."""
     actuator.actdim, actuator.dynprm[0] = 1, seconds
     actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
     if runge_kutta(model):
@@ -94,7 +137,8 @@ def set_lag(actuator, seconds, model):
 class ServoGain(ActuatorEffect):
     """A gain of a position servo, force = kp (u − q) − kv q̇, apart from the other one.
 
-    Both in the same ratio are `gain`. Ahead of it in the catalogue, so that it scales what these set.
+    Both in the same ratio are `gain`. Ahead of it in the catalogue, so that it scales what these
+    set.
     """
 
     acts_through = "control"
@@ -107,7 +151,8 @@ class ServoGain(ActuatorEffect):
 
 @catalogue
 class ServoStiffness(ServoGain):
-    """kp in force = kp (u − q) − kv q̇, in N·m/rad or N/m of the actuator's length; kv stays. Source: MuJoCo's <position>."""
+    """kp in force = kp (u − q) − kv q̇, in N·m/rad or N/m of the actuator's length; kv stays.
+    Source: MuJoCo's <position>."""
 
     name, related = "servo_stiffness", ("gain", "servo_damping", "stiffness")
 
@@ -134,9 +179,11 @@ class ServoStiffness(ServoGain):
 
 @catalogue
 class ServoDamping(ServoGain):
-    """kv in force = kp (u − q) − kv q̇, in N·m·s/rad or N·s/m; kp stays. Source: MuJoCo's <position>.
+    """kv in force = kp (u − q) − kv q̇, in N·m·s/rad or N·s/m; kp stays. Source: MuJoCo's
+    <position>.
 
-    The same force as `back_emf`, and as `viscous_damping` of the one joint it drives (but for a limited force): a class.
+    The same force as `back_emf`, and as `viscous_damping` of the one joint it drives (but for a
+    limited force): a class.
     """
 
     name, related = "servo_damping", ("gain", "servo_stiffness", "viscous_damping", "back_emf")
@@ -281,9 +328,12 @@ class Lag(ActuatorEffect):
         return replace(signal, lag=values[0])
 
     def write(self, spec, model, i, values):
-        set_lag(self.general(spec, model, i), values[0], model)
-        if runge_kutta(model):  # explodes on a filter faster than a step
-            refine(spec, values[0])
+        actuator, seconds = self.general(spec, model, i), values[0]
+        if runge_kutta(model):
+            set_lag(actuator, seconds, model)
+            refine(spec, seconds)  # explodes on a filter faster than a step
+        else:
+            set_lag(actuator, end_of_step(seconds, spec.option.timestep), model)
         return "mjcf"
 
 
@@ -301,7 +351,8 @@ class Delay(ActuatorEffect):
         return replace(signal, delay=values[0])
 
     def write(self, spec, model, i, values):
-        """MuJoCo reads its history as of each force evaluation, but only what was there before the step."""
+        """MuJoCo reads its history as of each force evaluation, but only what was there before
+        the step."""
         seconds, actuator, step = (
             values[0],
             spec.actuator(model.actuator(i).name),
@@ -314,17 +365,21 @@ class Delay(ActuatorEffect):
             refine(spec, seconds / 1.5)
             seconds += spec.option.timestep / 2
         elif seconds < step and actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
-            # a finer step would change everything: spread the command over later steps, as late on average
-            set_lag(self.general(spec, model, i), step / np.log1p(step / seconds), model)
+            # a finer step would change everything: spread the command over later steps, as late on
+            # average
+            set_lag(self.general(spec, model, i), end_of_step(seconds, step), model)
             return "mjcf"
         else:
             refine(spec, seconds)
         actuator.delay, actuator.interp = seconds, 1
+        # for a spec that is compiled before its time step is final
+        actuator.nsample = int(np.ceil(seconds / spec.option.timestep)) + 1
         return "mjcf"
 
 
 def nominal_delay(model, i):
-    """Seconds by which the nominal model delays actuator i: MuJoCo rounds a part of a step up to one."""
+    """Seconds by which the nominal model delays actuator i: MuJoCo rounds a part of a step up to
+    one."""
     return max(model.actuator_delay[i], model.opt.timestep) if model.actuator_delay[i] > 0 else 0.0
 
 
@@ -373,70 +428,16 @@ class DeadZone(ActuatorEffect):
         model = models[0]
         if not self._servo(model, i):
             return None
-        gain = np.array([m.actuator_gainprm[i, 0] for m in models])
-        bias = np.array([m.actuator_biasprm[i, :3] for m in models])
-        limit = np.array(
-            [
-                abs(m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else (np.inf, np.inf)
-                for m in models
-            ]
-        )
-        joint, u, gear = (
-            model.actuator_trnid[i, 0],
-            model.actuator_ctrladr[i],
-            model.actuator_gear[i, 0],
-        )
-        q, d = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
 
-        def absorbed(qpos, qvel, ctrl, time):
-            length, velocity = gear * qpos[:, q], gear * qvel[:, d]
-            F = gain * ctrl[:, u] + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * velocity
-            out = np.zeros_like(qvel)
-            out[:, d] = -gear * np.clip(
-                np.clip(F, -limit[:, 0], limit[:, 1]), -values[:, 0], values[:, 0]
-            )
-            return out
+        def absorbed(force, qvel, time):
+            return -np.clip(force, -values[:, 0], values[:, 0])
 
-        return absorbed
+        return lost(models, i, absorbed)
 
     def write(self, spec, model, i, values):
-        """For a motor on a joint: it turns a light wheel against a spring of its own instead, and a tendon whose
-        spring has a dead band hands on what is beyond it, about half a time step later, once it is wound up."""
-        motor = spec.actuator(model.actuator(i).name)
-        plain = not motor.biasprm[1:3].any() and motor.dyntype == mujoco.mjtDyn.mjDYN_NONE
-        if not (self.on_joint(model, i) and plain):
-            return "none"
-        explicit_inertia(spec, model)  # a total mass would count the wheel
-        h, gain, gear, joint = (
-            spec.option.timestep,
-            abs(motor.gainprm[0]),
-            motor.gear[0],
-            motor.target,
-        )
-        name = f"dead_zone:{motor.name}"
-        k = 1e-3 * self.strength(
-            model, i
-        )  # so soft that it travels far, and the joint's own travel adds nothing
-        inertia = max(0.5 * k * h**2, 1e-13)  # MuJoCo refuses less than 1e-15
-        # heavy for its inertia, that is too dense for air to matter
-        body = spec.worldbody.add_body(
-            name=name, mass=1.0, ipos=[0.0] * 3, inertia=[inertia] * 3, explicitinertial=True
-        )
-        wheel = body.add_joint(
-            name=name, type=mujoco.mjtJoint.mjJNT_HINGE, limited=mujoco.mjtLimited.mjLIMITED_FALSE
-        )
-        wheel.armature = wheel.frictionloss = wheel.ref = wheel.springref = (
-            0.0  # whatever the defaults say
-        )
-        wheel.stiffness, wheel.damping = [k, 0.0, 0.0], [k * h, 0.0, 0.0]
-        edge = gain * values[0] / k
-        tendon = spec.add_tendon(name=name, stiffness=[k, 0.0, 0.0], springlength=[-edge, edge])
-        tendon.wrap_joint(name, 1.0)
-        tendon.wrap_joint(joint, -2 * gear)
-        motor.target, motor.gear = name, [1.0, *motor.gear[1:]]
-        if motor.biasprm[0]:  # stays outside
-            constant_force(spec, f"{name}:bias", gear * motor.biasprm[0], JOINT_TRANSMISSION, joint)
-            motor.biasprm[0] = 0.0
-        if any(motor.forcerange):
-            motor.forcerange = np.array(motor.forcerange) + gain * values[0] * np.array([-1, 1])
-        return "mjcf"
+        """No actuator of MJCF has one: see part()."""
+        return "python"
+
+    def part(self, model, i, values):
+        law = "dead_zone_of_force" if self._servo(model, i) else "dead_zone"
+        return Part(law, model.actuator(i).name, {"half_width": float(values[0])})

@@ -15,6 +15,7 @@ is one class with the decorator @catalogue, and no other line.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -89,6 +90,15 @@ class Candidate:
         return tuple(p.nominal for p in self.parameters)
 
 
+class Part(NamedTuple):
+    """What corrected.py adds: a law of diagnosis/simulation/corrected_template.py, where, its
+    numbers."""
+
+    law: str
+    place: str  # the joint's or actuator's name
+    numbers: dict  # of the law's arguments: floats, lists of them, names
+
+
 class Effect:
     """One kind of physics; an id is always that of the model it is passed with."""
 
@@ -135,7 +145,8 @@ class Effect:
         raise NotImplementedError
 
     def probes(self, model, i, recordings):
-        """Values (P, parameters) to try first: by default each parameter a step up, and down where it may."""
+        """Values (P, parameters) to try first: by default each parameter a step up, and down
+        where it may."""
         parameters = self.parameters(model, i)
         nominal = [p.nominal for p in parameters]
         rows = [
@@ -147,11 +158,13 @@ class Effect:
         return np.array(rows)
 
     def merged(self, rows, amounts):
-        """(values, amount): the one probe, and how much of it, that does what these probes in these amounts do."""
+        """(values, amount): the one probe, and how much of it, that does what these probes in
+        these amounts do."""
         return rows[0], amounts[0]
 
     def far(self, model, i, recordings):
-        """Values (P, parameters) to try besides a small step: so far off an effect no longer acts in proportion."""
+        """Values (P, parameters) to try besides a small step: so far off an effect no longer acts
+        in proportion."""
         return ()
 
     def suited(self, parameters, model, i, recordings):
@@ -161,6 +174,16 @@ class Effect:
     def possible(self, values, nominal):
         """Whether a real machine can have these values, and not another effect by this name."""
         return True
+
+    def unseen(self, model, i, values, seen):
+        """The values with those that the recordings do not show (seen False) as the nominal model
+        has them.
+
+        Where physics ties them to the others, as near to that as these allow; what was seen never
+        moves.
+        """
+        nominal = (p.nominal for p in self.parameters(model, i))
+        return tuple(float(v if s else n) for v, n, s in zip(values, nominal, seen))
 
     def canonical(self, values):
         """The same effect in its usual numbers, where several sets of values mean the same."""
@@ -180,22 +203,27 @@ class Effect:
         """Add a constant force to qfrc (nv,) or xfrc (nbody, 6)."""
 
     def force(self, models, i, values):
-        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,)) -> force to add, (S,nv).
+        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,)) -> force to add,
+        (S,nv).
 
         models: S compiled models with every edit made; values (S, parameters).
         """
         return None
 
     def limit(self, models, i, values):
-        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,), qfrc_bias (S,nv)) -> (S,nv), at least 0.
+        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,), qfrc_bias
+        (S,nv)) -> (S,nv), at least 0.
 
-        By so much the dry friction that a joint can hold, its frictionloss, is larger. The arguments are those of force();
-        qfrc_bias is MuJoCo's: Coriolis forces minus gravity, so that -qfrc_bias is the load from outside, but for contacts.
+        By so much the dry friction that a joint can hold, its frictionloss, is larger. The
+        arguments are those of force();
+        qfrc_bias is MuJoCo's: Coriolis forces minus gravity, so that -qfrc_bias is the load from
+        outside, but for contacts.
         """
         return None
 
     def rubs(self, models, i, values):
-        """As force(), the friction that limit() allows on moving joints: −limit · sign(v). For linear chains, which cannot stick."""
+        """As force(), the friction that limit() allows on moving joints: −limit · sign(v). For
+        linear chains, which cannot stick."""
         limit = self.limit(models, i, values)
         if limit is None:
             return None
@@ -214,11 +242,17 @@ class Effect:
         return 0.0, 1.0, 0.0
 
     def write(self, spec, model, i, values):
-        """Put the effect into spec, of the nominal model; return 'mjcf', 'python', 'measurement' or 'none'.
+        """Put the effect into spec, of the nominal model; return 'mjcf', 'python', 'measurement'
+        or 'none'.
 
         'python': spec holds it only in part or not at all, corrected.py does (see part()).
         """
         raise NotImplementedError
+
+    def part(self, model, i, values):
+        """The Part of corrected.py that holds what write() left to it, in full; None for what
+        never does."""
+        return None
 
     def overrides(self, method):
         """Whether the effect acts by this method."""
@@ -248,6 +282,16 @@ def joints_of(model, name):
     raise KeyError(f"no joint {name}")
 
 
+def end_of_step(lag, step):
+    """Time constant of the filter that is `lag` seconds late on average, read at the end of each
+    step.
+
+    Its values follow a held control by the factor a = exp(−step/T) a step, in all step · a/(1 − a)
+    short of it; a filter with T = lag would be half a step early there. All in seconds.
+    """
+    return step / np.log1p(step / lag)
+
+
 def turns(model, j):
     """Whether joint j is a hinge."""
     return model.jnt_type[j] == HINGE
@@ -259,7 +303,8 @@ def runge_kutta(model):
 
 
 def displace(spec, kind, name, by):
-    """Move a spec's "body" or "geom" by a vector (3,) in the axes of its body, whatever <frame>s it stands in."""
+    """Move a spec's "body" or "geom" by a vector (3,) in the axes of its body, whatever <frame>s
+    it stands in."""
     find = lambda within: getattr(within, kind)(name)
     element, turn = find(spec), np.eye(3)
     if element.frame is not None:
@@ -278,7 +323,8 @@ def displace(spec, kind, name, by):
 
 
 def explicit_inertia(spec, model):
-    """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot be edited."""
+    """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot
+    be edited."""
     compiler, on = spec.compiler, mujoco.mjtInertiaFromGeom
     # even over what the file says
     implied = compiler.inertiafromgeom == on.mjINERTIAFROMGEOM_TRUE or compiler.settotalmass > 0
@@ -311,7 +357,8 @@ def angle(spec, model, j, value):
 
 
 def authored(spec, model, j, value):
-    """A position of joint j as the spec writes it. What was attached from another file keeps that file's units, and stands in a frame."""
+    """A position of joint j as the spec writes it. What was attached from another file keeps that
+    file's units, and stands in a frame."""
     if not (turns(model, j) and spec.frames):
         return angle(spec, model, j, value)
     other, name = spec.copy(), model.joint(j).name
@@ -324,7 +371,8 @@ def authored(spec, model, j, value):
 
 
 def passive(spec, name, trntype, target, **block):
-    """Add a dcmotor with neither inputs nor electrics: a carrier of cogging and friction, without a control."""
+    """Add a dcmotor with neither inputs nor electrics: a carrier of cogging and friction, without
+    a control."""
     motor = spec.add_actuator(name=name, trntype=trntype, target=target)
     motor.forcelimited = motor.ctrllimited = (
         mujoco.mjtLimited.mjLIMITED_FALSE

@@ -25,7 +25,10 @@ from diagnosis.effects.joints import JointEffect
 REST, RESTING = (
     0.02,
     0.05,
-)  # share of a joint's travel about its end, and of all rows found there, where it seems to lie at its stop
+    # share of a joint's travel about its end, and of all rows found there, where it seems to lie
+    # at its
+    # stop
+)
 
 
 class InertialEffect(Effect):
@@ -122,26 +125,46 @@ class Inertia(InertialEffect):
         return tuple(Parameter(n, "kg·m²", I, 0.02 * I, 100 * I, 0.02 * I) for n, I in moments)
 
     def possible(self, values, nominal):
-        """No principal moment of a rigid body is larger than the sum of the others; one at its nominal value did not show, and may be any."""
-        return 2 * max(values) <= sum(values) * (1 + 1e-6) or any(
-            v == n for v, n in zip(values, nominal)
-        )
+        """No principal moment of a rigid body is larger than the sum of the others; one at its
+        nominal value did not show, and may be any."""
+        return rigid(values) or any(v == n for v, n in zip(values, nominal))
+
+    def unseen(self, model, i, values, seen):
+        """What did not show goes back to its nominal value, or as near to it as a rigid body with
+        the others allows."""
+        return self._rigid(values, np.where(seen, np.nan, model.body_inertia[i]))
+
+    @staticmethod
+    def _rigid(values, back):
+        """The moments (3,), those with a number in `back` moved to it as far as the triangle
+        inequality allows."""
+        moments = [float(v if np.isnan(b) else b) for v, b in zip(values, back)]
+        for k in sorted(np.flatnonzero(np.isfinite(back)), key=lambda k: -moments[k]):
+            one, other = moments[:k] + moments[k + 1 :]
+            moments[k] = min(max(moments[k], ROUNDED * abs(one - other)), (one + other) / ROUNDED)
+        return tuple(moments)
 
     def edit(self, model, i, values):
         model.body_inertia[i] = values
 
     def write(self, spec, model, i, values):
-        """As fitted; what did not show moves along as far as a rigid body needs, for no other compiles."""
-        moments, more = list(values), 1 + 1e-6
-        for k in sorted(
-            (k for k in range(3) if values[k] == model.body_inertia[i][k]), key=lambda k: -values[k]
-        ):
-            one, other = moments[:k] + moments[k + 1 :]
-            moments[k] = min(max(moments[k], more * abs(one - other)), (one + other) / more)
-        lacking = max(2 * max(moments) - sum(moments), 0.0) / 2
-        return super().write(
-            spec, model, i, [m if m == max(moments) else m + more * lacking for m in moments]
-        )
+        """As fitted: what is at its nominal value did not show and moves along as far as a rigid
+        body needs, for no other compiles.
+
+        Where all three were fitted and no rigid body has them nothing is written: each is as
+        likely to be wrong.
+        """
+        nominal = model.body_inertia[i]
+        moments = self._rigid(values, np.where(np.equal(values, nominal), nominal, np.nan))
+        return super().write(spec, model, i, moments) if rigid(moments) else "none"
+
+
+ROUNDED = 1 + 1e-6  # a margin for what rounding does to the triangle inequality
+
+
+def rigid(moments):
+    """Whether a rigid body has these principal moments (3,)."""
+    return bool(2 * max(moments) <= sum(moments) * ROUNDED)
 
 
 @catalogue
@@ -228,7 +251,8 @@ class SensorEffect(Effect):
         return self.kind == "sensor" or model.jnt_type[i] in (HINGE, SLIDE)
 
     def stops(self, model, i, recordings):
-        """[(reading, end of the range)] where the joint seems to lie at its stop: there a sensor's fault shows at once."""
+        """[(reading, end of the range)] where the joint seems to lie at its stop: there a
+        sensor's fault shows at once."""
         limited = self.kind == "joint" and model.jnt_limited[i]
         position = JointEffect.travel(model, i, recordings)[0] if limited else ()
         if not len(position):
@@ -265,7 +289,8 @@ class SensorBias(SensorEffect):
 
     @staticmethod
     def shared(model, i):
-        """Whether what reads the joint too would see its zero move: a fixed tendon, an actuator in the parent's frame, a muscle."""
+        """Whether what reads the joint too would see its zero move: a fixed tendon, an actuator
+        in the parent's frame, a muscle."""
         wrapped = (model.wrap_objid == i) & (model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT)
         gain, bias = mujoco.mjtGain, mujoco.mjtBias
         plain = (

@@ -1,6 +1,7 @@
 """Physics of real drives: gears whose friction follows their load, bearings that run out of true.
 
-Their dry friction depends on the state, so a simulation sets it anew before each step (see Effect.limit),
+Their dry friction depends on the state, so a simulation sets it anew before each step (see
+Effect.limit),
 and beside corrected.xml a script does the same (corrected.py).
 """
 
@@ -9,10 +10,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from diagnosis.effects.actuators import ActuatorEffect, actuator_force, lost
 from diagnosis.effects.base import (
+    HUGE,
     JOINT_TRANSMISSION,
     Candidate,
     Parameter,
+    Part,
     Place,
     catalogue,
 )
@@ -29,7 +33,8 @@ PHASES = 0.0, np.pi / 2, np.pi, 1.5 * np.pi
 
 
 def drives_of(model, j):
-    """Ids of the actuators of joint j whose force follows from position, speed and control alone."""
+    """Ids of the actuators of joint j whose force follows from position, speed and control
+    alone."""
     return [
         a
         for a in range(model.nactuator)
@@ -40,36 +45,6 @@ def drives_of(model, j):
         and model.actuator_biastype[a] in (0, 1)
         and model.actuator_dyntype[a] == int(mujoco.mjtDyn.mjDYN_NONE)
     ]
-
-
-def actuator_force(models, a):
-    """Function (qpos (S,nq), qvel (S,nv), ctrl (S,nu)) -> (S,) force of actuator a on a joint, within its range.
-
-    force = clip((g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇), l the length gear · q.
-    """
-    model = models[0]
-    joint, u, gear = (
-        model.actuator_trnid[a, 0],
-        model.actuator_ctrladr[a],
-        model.actuator_gear[a, 0],
-    )
-    q, d = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-    gain, bias = (
-        np.array([getattr(m, f"actuator_{f}prm")[a, :3] for m in models]).T
-        for f in ("gain", "bias")
-    )
-    gain[1:] *= model.actuator_gaintype[a] == int(mujoco.mjtGain.mjGAIN_AFFINE)
-    bias *= model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    free = -np.inf, np.inf
-    low, high = np.array(
-        [m.actuator_forcerange[a] if m.actuator_forcelimited[a] else free for m in models]
-    ).T
-
-    def force(qpos, qvel, ctrl):
-        at = np.stack([np.ones(len(qpos)), gear * qpos[:, q], gear * qvel[:, d]])
-        return np.clip((gain * at).sum(axis=0) * ctrl[:, u] + (bias * at).sum(axis=0), low, high)
-
-    return force
 
 
 def drive_torque(models, j):
@@ -89,8 +64,10 @@ def drive_torque(models, j):
 
 
 class DryFriction(JointEffect):
-    """Dry friction of a level that depends on the state: |F| ≤ level, added to the joint's frictionloss."""
+    """Dry friction of a level that depends on the state: |F| ≤ level, added to the joint's
+    frictionloss."""
 
+    law = ""  # in corrected.py
     acts_through, simplicity, related = "velocity", 3, ("coulomb_friction", *DISSIPATION, "gain")
 
     def edit(self, model, i, values):
@@ -108,6 +85,10 @@ class DryFriction(JointEffect):
         """Function (qpos, qvel, ctrl, time, qfrc_bias) -> (S,), the level in the joint."""
         raise NotImplementedError
 
+    def part(self, model, i, values):
+        numbers = {p.name: float(v) for p, v in zip(self.parameters(model, i), values)}
+        return Part(self.law, model.joint(i).name, numbers)
+
     def limit(self, models, i, values):
         d, level = models[0].jnt_dofadr[i], self.level(models, i, values)
 
@@ -123,17 +104,24 @@ class DryFriction(JointEffect):
 class LoadFriction(DryFriction):
     """Gear teeth pressed together by what they carry: |F| ≤ share · |τ_drive − external · τ_load|.
 
-    τ_drive is the force of the joint's drives, τ_load what pulls on it from outside (gravity and Coriolis forces,
-    −qfrc_bias; contacts are not counted), both in N·m (N in a slide) of the joint; they press from both sides where
-    they oppose each other. share is `driving` where the drive moves the joint (τ_drive · v ≥ 0), `driven` where the
-    load does. external 1 is a train of gears between two loads, 0 counts the drive's side alone. All are ratios.
-    With both shares equal and a constant load it is `coulomb_friction`; driving alone, without a load from outside, is
-    in motion a smaller `gain`. Sources: Duclusaud, Passault, Padois, Daniel: Extended Friction Models for the Physics
-    Simulation of Servo Actuators (2024), models M4 to M6; efficiency forward and backward of gears: Linderoth,
+    τ_drive is the force of the joint's drives, τ_load what pulls on it from outside (gravity and
+    Coriolis forces,
+    −qfrc_bias; contacts are not counted), both in N·m (N in a slide) of the joint; they press
+    from both sides where
+    they oppose each other. share is `driving` where the drive moves the joint (τ_drive · v ≥ 0),
+    `driven` where the
+    load does. external 1 is a train of gears between two loads, 0 counts the drive's side alone.
+    All are ratios.
+    With both shares equal and a constant load it is `coulomb_friction`; driving alone, without a
+    load from outside, is
+    in motion a smaller `gain`. Sources: Duclusaud, Passault, Padois, Daniel: Extended Friction
+    Models for the Physics
+    Simulation of Servo Actuators (2024), models M4 to M6; efficiency forward and backward of
+    gears: Linderoth,
     Stolt, Robertsson, Johansson (2013).
     """
 
-    name, amplitudes = "load_friction", 2
+    name, law, amplitudes = "load_friction", "load_friction", 2
 
     def fits(self, model, i):
         return super().fits(model, i) and bool(drives_of(model, i))
@@ -166,18 +154,20 @@ class LoadFriction(DryFriction):
 
 @catalogue
 class FrictionMap(DryFriction):
-    """Coulomb friction that comes and goes along the travel: |F| ≤ level · (1 + contrast · sin(waves·q + phase)).
+    """Coulomb friction that comes and goes along the travel: |F| ≤ level · (1 + contrast ·
+    sin(waves·q + phase)).
 
-    level in N·m (N), contrast 0 to 1, waves per rad (m) of the joint, phase in rad: a bearing or rail out of true.
+    level in N·m (N), contrast 0 to 1, waves per rad (m) of the joint, phase in rad: a bearing or
+    rail out of true.
     Without contrast it is `coulomb_friction`. Of any other shape: see FrictionCurve.
     """
 
-    name, amplitudes = "friction_map", 1
+    name, law, amplitudes = "friction_map", "friction_wave", 1
 
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
         return (
-            Parameter("level", force, 0.0, 0.0, 1e6 * M, 0.05 * M),
+            Parameter("level", force, 0.0, 0.0, HUGE * M, 0.05 * M),
             Parameter("contrast", "1", 0.8, 0.0, 1.0, -0.1),
             Parameter("waves", self.unit(model, i, "1", "rad/m"), 6.0, 0.1, 1e6, 0.1),
             Parameter("phase", "rad", 0.0, -10.0, 10.0, 0.1),
@@ -216,9 +206,11 @@ class FrictionMap(DryFriction):
 
 
 class FrictionCurve(DryFriction):
-    """Coulomb friction along the travel of any shape: its level at knots, linear between, flat beyond. N·m or N.
+    """Coulomb friction along the travel of any shape: its level at knots, linear between, flat
+    beyond. N·m or N.
 
-    As `unknown` it is made for its knots, by friction_curve(); it goes by the name of FrictionMap, which has one shape.
+    As `unknown` it is made for its knots, by friction_curve(); it goes by the name of
+    FrictionMap, which has one shape.
     """
 
     name, kind = "friction_map", "joint"
@@ -237,8 +229,12 @@ class FrictionCurve(DryFriction):
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
         return tuple(
-            Parameter(f"level at {x:.3g}", force, 0.0, 0.0, 1e6 * M, 0.05 * M) for x in self.knots
+            Parameter(f"level at {x:.3g}", force, 0.0, 0.0, HUGE * M, 0.05 * M) for x in self.knots
         )
+
+    def part(self, model, i, values):
+        numbers = {"knots": list(self.knots), "levels": [float(v) for v in values]}
+        return Part("friction_curve", model.joint(i).name, numbers)
 
     def level(self, models, i, values):
         q, knots, rows = models[0].jnt_qposadr[i], np.array(self.knots), np.arange(len(values))
@@ -252,7 +248,114 @@ class FrictionCurve(DryFriction):
         return at
 
 
+class DriveLimit(ActuatorEffect):
+    """What a motor or servo on a hinge or slide, without a filter of its own, cannot give."""
+
+    law, acts_through = "", "control"
+
+    def fits(self, model, i):
+        return bool(
+            super().fits(model, i)
+            and self.on_joint(model, i)
+            and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
+        )
+
+    def write(self, spec, model, i, values):
+        return "python"
+
+    def part(self, model, i, values):
+        numbers = {p.name: float(v) for p, v in zip(self.parameters(model, i), values)}
+        return Part(self.law, model.actuator(i).name, numbers)
+
+
+@catalogue
+class RateLimit(DriveLimit):
+    """The control follows at a limited pace: |ẏ| ≤ rate, in units of the control per second.
+
+    A servo's goal that is ramped by its firmware, a valve that opens slowly. It starts at the first
+    control. Small steps pass as they are, unlike with a `lag`.
+    """
+
+    name, law, simplicity, related = "rate_limit", "rate_limit", 2, ("lag", "delay", "gain")
+
+    def parameters(self, model, i):
+        u = self.strength(model, i) / max(abs(model.actuator_gainprm[i, 0]), 1e-12)
+        return (Parameter("rate", "control/s", np.inf, 1e-3 * u, HUGE * u, u),)
+
+    def probes(self, model, i, recordings):
+        u = model.actuator_ctrladr[i]
+        pace = [abs(np.diff(r.ctrl[:, u]) / np.diff(r.time)) for r in recordings]
+        pace = np.nan_to_num(np.concatenate(pace))
+        fastest = np.quantile(pace[pace > 0], 0.9) if (pace > 0).any() else 0.0
+        low, high = (getattr(self.parameters(model, i)[0], f) for f in ("low", "high"))
+        return np.clip(fastest * np.array([[0.7], [0.3], [0.1]]), low, high)
+
+    def command(self, signal, model, i, values):
+        return replace(signal, rate=values[0])
+
+
+@catalogue
+class TorqueSpeed(DriveLimit):
+    """The largest force falls with speed: |τ| ≤ stall − slope · |v| where τ v > 0.
+
+    stall in N·m (N), slope in N·m·s/rad (N·s/m), τ and v of the actuator: a motor at the end of its
+    voltage. Well below the limit nothing changes, unlike with `back_emf`; without slope it is
+    `saturation` of the driving force. Source: the torque–speed line of permanent-magnet motors.
+    """
+
+    name, law, simplicity = "torque_speed", "torque_speed", 2
+    related = "saturation", "back_emf", "gain"
+
+    def parameters(self, model, i):
+        F, unit = self.strength(model, i), self.unit(model, i)
+        slope = {"N·m": "N·m·s/rad", "N": "N·s/m"}[unit]
+        return (
+            Parameter("slope", slope, 0.0, 0.0, HUGE * F, 0.05 * F),
+            Parameter("stall", unit, np.inf, 1e-4 * F, HUGE * F, 0.05 * F),
+        )
+
+    def probes(self, model, i, recordings):
+        used = np.quantile(self.forces(model, i, recordings), 0.98)
+        j, gear = model.actuator_trnid[i, 0], abs(model.actuator_gear[i, 0])
+        _, speed = JointEffect.travel(model, j, recordings)
+        fast = gear * np.quantile(speed, 0.95) + 1e-6 if len(speed) else 1.0
+        rows = [(share * used / fast, used) for share in (0.3, 0.7)] if used > 0 else []
+        return np.array(rows).reshape(-1, 2)
+
+    def possible(self, values, nominal):
+        return values[0] > 0 and np.isfinite(values[1])
+
+    def force(self, models, i, values):
+        slope, stall = values.T
+
+        def missing(force, speed, time):
+            with np.errstate(invalid="ignore"):
+                most = np.maximum(stall - slope * abs(speed), 0.0)
+            return np.where(force * speed > 0, np.clip(force, -most, most) - force, 0.0)
+
+        return lost(models, i, missing)
+
+
+@catalogue
+class GainFade(DriveLimit):
+    """The drive weakens: τ exp(−rate · t), rate in 1/s, t the recording's time in s.
+
+    A battery that runs down, a motor that warms up and loses its magnets' strength. A drive that is
+    as weak from the beginning has another `gain`.
+    """
+
+    name, law, amplitudes, simplicity = "gain_fade", "gain_fade", 1, 2
+    related = ("gain",)
+
+    def parameters(self, model, i):
+        return (Parameter("rate", "1/s", 0.0, 0.0, 10.0, 0.01),)
+
+    def force(self, models, i, values):
+        return lost(models, i, lambda force, speed, time: force * np.expm1(-values[:, 0] * time))
+
+
 def friction_curve(model, joint, knots):
-    """Candidate for a friction map of any shape in a joint: see FrictionCurve. Parameters: the level at each knot."""
+    """Candidate for a friction map of any shape in a joint: see FrictionCurve. Parameters: the
+    level at each knot."""
     effect = FrictionCurve(knots)
     return Candidate(effect, Place("joint", joint), effect.parameters(model, model.joint(joint).id))

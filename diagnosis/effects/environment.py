@@ -47,7 +47,8 @@ class Wind(Effect):
         )
 
     def far(self, model, i, recordings):
-        """Breezes and gusts along every axis: drag grows with the square of the speed, and small ones say little."""
+        """Breezes and gusts along every axis: drag grows with the square of the speed, and small
+        ones say little."""
         return [
             tuple(model.opt.wind + speed * axis)
             for speed in (3.0, -3.0, 10.0, -10.0)
@@ -139,7 +140,8 @@ class ContactEffect(Effect):
 
     @staticmethod
     def partner(model, i):
-        """The geom this one mostly touches, or None: a static one if any, else that with most friction."""
+        """The geom this one mostly touches, or None: a static one if any, else that with most
+        friction."""
         meets = touchable(model, i)
         if not meets.any():
             return None
@@ -148,7 +150,8 @@ class ContactEffect(Effect):
 
     @classmethod
     def pair(cls, model, i):
-        """What geom i's contacts have nominally: condim, friction (3,), solref (2,), solimp (5,)."""
+        """What geom i's contacts have nominally: condim, friction (3,), solref (2,), solimp
+        (5,)."""
         condim, friction, solref, solimp = cls._mixed(model, i)
         if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE) and solref[0] > 0:
             solref[0] = max(solref[0], 2 * model.opt.timestep)  # as MuJoCo does

@@ -1,4 +1,5 @@
-"""Effects in a joint: a hinge or slide, some in a ball joint too. Their scales follow the joint's own inertia."""
+"""Effects in a joint: a hinge or slide, some in a ball joint too. Their scales follow the joint's
+own inertia."""
 
 from dataclasses import replace
 
@@ -30,7 +31,9 @@ STRENGTHS = (
     10.0,
     100.0,
 )  # of a force that grows faster than in proportion, over what turns the fastest motion round
-FALLS = 0.05  # share by which friction at rest is larger than that of motion, at least, that it is called Stribeck's
+# share by which friction at rest is larger than that of motion, at least, that it is called
+# Stribeck's
+FALLS = 0.05
 DISSIPATION = ("viscous_damping", "coulomb_friction", "quadratic_damping", "back_emf")
 
 
@@ -72,7 +75,8 @@ class JointEffect(Effect):
         )
 
     def reach(self, model, i, recordings):
-        """How far from its spring's rest, and how fast, the joint was recorded, but for the odd row."""
+        """How far from its spring's rest, and how fast, the joint was recorded, but for the odd
+        row."""
         position, speed = self.travel(model, i, recordings)
         far = abs(position - model.qpos_spring[model.jnt_qposadr[i]])
         return [
@@ -107,7 +111,8 @@ class JointNumber(JointEffect):
 
     @staticmethod
     def scaled(parameter, size):
-        """The parameter with a step and bounds that are the usual forces where it acts `size` times as much as at one."""
+        """The parameter with a step and bounds that are the usual forces where it acts `size`
+        times as much as at one."""
         p = parameter
         return replace(
             p,
@@ -240,7 +245,8 @@ class NonlinearStiffness(JointNumber):
 
 @catalogue
 class StribeckFriction(JointEffect):
-    """Dry friction that falls from `static` at rest to `coulomb` when moving faster than `velocity`.
+    """Dry friction that falls from `static` at rest to `coulomb` when moving faster than
+    `velocity`.
 
     |F| = coulomb + (static − coulomb) exp(−(v/velocity)²): here as frictionloss `static` and
     a force that gives back what it is too much once moving; in MJCF with LuGre bristles.
@@ -258,7 +264,8 @@ class StribeckFriction(JointEffect):
         )
 
     def suited(self, parameters, model, i, recordings):
-        """It has fallen at the speeds that are reached: what still falls there is another law of friction."""
+        """It has fallen at the speeds that are reached: what still falls there is another law of
+        friction."""
         coulomb, static, velocity = parameters
         _, speed = self.travel(model, i, recordings)
         return (
@@ -376,7 +383,8 @@ class Cogging(JointEffect):
         )
 
     def probes(self, model, i, recordings):
-        """Ripples close enough to each other for one of them to stay in step over the whole travel."""
+        """Ripples close enough to each other for one of them to stay in step over the whole
+        travel."""
         position, _ = self.travel(model, i, recordings)
         travel = np.ptp(np.quantile(position, [0.05, 0.95])) + 1e-6
         if turns(model, i) and travel > 5:

@@ -1,4 +1,5 @@
-"""What lies between a drive and its link: bristles that bend before they slip, springs, shared rotors and belts.
+"""What lies between a drive and its link: bristles that bend before they slip, springs, shared
+rotors and belts.
 
 All have an MJCF form, with parts that the nominal model lacks (see Effect.build).
 """
@@ -41,11 +42,15 @@ DAMPED = 0.1  # its damping ratio
 
 @catalogue
 class Presliding(JointEffect):
-    """Dry friction whose contacts bend like bristles before they slip: F = −σ z, ż = v − σ |v| z / F_c.
+    """Dry friction whose contacts bend like bristles before they slip: F = −σ z, ż = v − σ |v| z
+    / F_c.
 
-    σ `stiffness` in N·m/rad (N/m), F_c `frictionloss` in N·m (N), in addition to the joint's own. This is Dahl's model, and
-    LuGre's without micro damping and Stribeck's fall; with σ → ∞ it is `coulomb_friction`, for motions below F_c/σ it is
-    `stiffness`. Sources: Dahl, A Solid Friction Model (1968); Canudas de Wit, Olsson, Åström, Lischinsky (1995).
+    σ `stiffness` in N·m/rad (N/m), F_c `frictionloss` in N·m (N), in addition to the joint's own.
+    This is Dahl's model, and
+    LuGre's without micro damping and Stribeck's fall; with σ → ∞ it is `coulomb_friction`, for
+    motions below F_c/σ it is
+    `stiffness`. Sources: Dahl, A Solid Friction Model (1968); Canudas de Wit, Olsson, Åström,
+    Lischinsky (1995).
     A window begins with the bristle as it is after the motion recorded before.
     """
 
@@ -94,7 +99,8 @@ class Presliding(JointEffect):
 
     @staticmethod
     def _carried(model, values):
-        """The values with the stiffness that the integrator carries: Runge-Kutta explodes on what yields within a step."""
+        """The values with the stiffness that the integrator carries: Runge-Kutta explodes on what
+        yields within a step."""
         level, stiffness = values
         if runge_kutta(model):
             stiffness = min(stiffness, RELAXES * level / (model.opt.timestep * FASTEST))
@@ -118,11 +124,15 @@ class Presliding(JointEffect):
 
 @catalogue
 class JointElasticity(Backlash):
-    """A spring and a damper between drive and link: J θ̈ = τ − F, F = k (θ − q) + c (θ̇ − q̇) moves the link.
+    """A spring and a damper between drive and link: J θ̈ = τ − F, F = k (θ − q) + c (θ̇ − q̇)
+    moves the link.
 
-    k `stiffness` in N·m/rad (N/m), c `damping` in N·m·s/rad (N·s/m). The sensor sits at the motor, as do the joint's
-    friction and armature J; without armature the motor gets one per cent of the joint's inertia. At the tone's frequency
-    √(k/J') it is no `delay`: that turns no phase back. Source: Spong, Modeling and Control of Elastic Joint Robots (1987).
+    k `stiffness` in N·m/rad (N/m), c `damping` in N·m·s/rad (N·s/m). The sensor sits at the
+    motor, as do the joint's
+    friction and armature J; without armature the motor gets one per cent of the joint's inertia.
+    At the tone's frequency
+    √(k/J') it is no `delay`: that turns no phase back. Source: Spong, Modeling and Control of
+    Elastic Joint Robots (1987).
     """
 
     name, simplicity, amplitudes, related = "joint_elasticity", 3, 0, ("delay", "lag", "backlash")
@@ -176,7 +186,8 @@ class JointElasticity(Backlash):
 
 
 class CoupledEffect(JointEffect):
-    """An effect in the sum of the positions of a joint and the one that carries it, named "a+b": a fixed tendon."""
+    """An effect in the sum of the positions of a joint and the one that carries it, named "a+b":
+    a fixed tendon."""
 
     unit_names = "", ""
     number, field = "", ""
@@ -217,10 +228,13 @@ class CoupledEffect(JointEffect):
 
 @catalogue
 class CoupledFriction(CoupledEffect):
-    """Dry friction in what two joints turn together: the same |F| ≤ level in both, against q̇_a + q̇_b. N·m or N.
+    """Dry friction in what two joints turn together: the same |F| ≤ level in both, against q̇_a +
+    q̇_b. N·m or N.
 
-    As in differential wrists, linkages and belts that run through a joint. Beside `coulomb_friction` of each joint, which
-    opposes its own speed. Source: MuJoCo's tendon frictionloss; Siciliano et al., Robotics (2009), 5.4 on transmissions.
+    As in differential wrists, linkages and belts that run through a joint. Beside
+    `coulomb_friction` of each joint, which
+    opposes its own speed. Source: MuJoCo's tendon frictionloss; Siciliano et al., Robotics
+    (2009), 5.4 on transmissions.
     """
 
     name, number, field, acts_through = "coupled_friction", "level", "frictionloss", "velocity"
@@ -231,7 +245,8 @@ class CoupledFriction(CoupledEffect):
 class CoupledInertia(CoupledEffect):
     """A rotor that two joints turn together: kinetic energy J (q̇_a + q̇_b)² / 2. kg·m² or kg.
 
-    The off-diagonal part is what `armature` of both joints lacks. Source: as CoupledFriction; MuJoCo's tendon armature.
+    The off-diagonal part is what `armature` of both joints lacks. Source: as CoupledFriction;
+    MuJoCo's tendon armature.
     """
 
     name, number, field, constants = "coupled_inertia", "inertia", "armature", True
@@ -239,7 +254,8 @@ class CoupledInertia(CoupledEffect):
 
 
 def pairs(model):
-    """[(a, b)] joints of one type, a hinge or slide each, the only one of its body, b's body hanging on a's."""
+    """[(a, b)] joints of one type, a hinge or slide each, the only one of its body, b's body
+    hanging on a's."""
     single = {
         model.jnt_bodyid[j]: j
         for j in range(model.njnt)

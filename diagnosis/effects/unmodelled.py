@@ -1,6 +1,7 @@
 """A force in a joint that the catalogue has no name for: some curve of one variable.
 
-candidate = curve(model, 'elbow', 'velocity:elbow', knots)      # its parameters: the force at each knot
+candidate = curve(model, 'elbow', 'velocity:elbow', knots)      # its parameters: the force at
+each knot
 """
 
 import mujoco
@@ -11,17 +12,29 @@ from diagnosis.effects.base import (
     JOINT_TRANSMISSION,
     Candidate,
     Parameter,
+    Part,
     Place,
     constant_force,
 )
+from diagnosis.effects.drives import drive_torque
 from diagnosis.effects.joints import JointEffect
+
+CLOSE = 0.05  # of a curve's range, by which a polynomial may miss it
+BEYOND = 3.0  # times its largest force, at most, at half the travel beyond it
+BETWEEN = 10  # points looked at between two knots
+FAR = 1e3  # times the travel, where the highest power decides
 
 
 class Unknown(JointEffect):
-    """A force in the joint that is some curve of one variable: its values at knots, linear between, flat beyond.
+    """A force in the joint that is some curve of one variable: its values at knots, linear
+    between, flat beyond.
 
-    variable: 'position:<joint>', 'velocity:<joint>', 'control:<actuator>' or 'time'. factor: None, or what the curve is
-    multiplied by: 'control:<actuator>' for what it is asked for (see asked), or 'velocity:<joint>' for its sign. wave: a sine
+    variable: 'position:<joint>', 'velocity:<joint>', 'control:<actuator>', 'load:<joint>' (the
+    force
+    of its drives) or 'time'. factor:
+    None, or what the curve is
+    multiplied by: 'control:<actuator>' for what it is asked for (see asked), or
+    'velocity:<joint>' for its sign. wave: a sine
     through two knots, a quarter of its period apart.
     """
 
@@ -66,14 +79,7 @@ class Unknown(JointEffect):
         model = models[0]
         d = model.jnt_dofadr[i]
 
-        def read(variable, qpos, qvel, ctrl, time):
-            kind, _, name = variable.partition(":")
-            if kind == "time":
-                return time
-            if kind == "control":
-                return ctrl[:, model.actuator_ctrladr[model.actuator(name).id]]
-            joint = model.joint(name)
-            return qpos[:, joint.qposadr[0]] if kind == "position" else qvel[:, joint.dofadr[0]]
+        read = reader(models)
 
         def curve(*state):
             x, out = read(self.variable, *state), np.zeros_like(state[1])
@@ -89,44 +95,175 @@ class Unknown(JointEffect):
 
         return curve
 
+    def part(self, model, i, values):
+        numbers = {
+            "of": self.variable,
+            "knots": list(self.knots),
+            "forces": [float(v) for v in values],
+            "factor": self.factor,
+        }
+        return Part("wave" if self.wave else "curve", model.joint(i).name, numbers)
+
     def write(self, spec, model, i, values):
-        """As a constant and a cubic in the joint's own position or velocity, if that is within 5 % of the curve."""
+        """As a constant and a polynomial in the joint's own position or velocity, where one holds
+        the curve.
+
+        The lowest order that stays within 5 % of the curve, between the knots too, and beyond them
+        does not run away (see holds); else it is left to corrected.py.
+        """
         joint = spec.joint(model.joint(i).name)
-        x, y = np.array(self.knots), np.array(values)
         if self.factor or self.wave:
-            return "none"
+            return "python"
         if self.variable == f"velocity:{joint.name}":
-            powers, field = [x, x * abs(x), x**3], joint.damping
-        elif self.variable == f"position:{joint.name}":
-            shift = (
-                x - spec.copy().compile().joint(joint.name).qpos_spring[0]
-            )  # where an offset may have moved it
-            powers, field = [shift, shift**2, shift**3], joint.stiffness
+            zero, powers, field = (
+                0.0,
+                (lambda x: x, lambda x: x * abs(x), lambda x: x**3),
+                "damping",
+            )
+        elif self.variable == f"position:{joint.name}":  # from where an offset may have moved it
+            zero = spec.copy().compile().joint(joint.name).qpos_spring[0]
+            powers, field = (lambda x: x, lambda x: x**2, lambda x: x**3), "stiffness"
         else:
-            return "none"
-        basis = np.stack([np.ones_like(x), *powers], axis=1)
-        size = abs(basis).max(axis=0)
-        fit = np.linalg.lstsq(basis / size, y, rcond=None)[0] / size
-        if abs(basis @ fit - y).max() > 0.05 * np.ptp(y):
-            return "none"
-        field[:] = np.array(field) - fit[1:]
+            return "python"
+        polynomial = self._polynomial(zero, powers, np.array(values))
+        if polynomial is None:
+            return "python"
+        setattr(joint, field, np.array(getattr(joint, field)) - polynomial[1:])
         names = [
             f"unknown:{joint.name}",
             *(f"unknown:{joint.name}:{n}" for n in range(2, len(spec.actuators) + 3)),
         ]
         taken = {actuator.name for actuator in spec.actuators}  # by a corrected model's own
-        constant_force(
-            spec,
-            next(name for name in names if name not in taken),
-            fit[0],
-            JOINT_TRANSMISSION,
-            joint.name,
-        )
+        name = next(name for name in names if name not in taken)
+        constant_force(spec, name, polynomial[0], JOINT_TRANSMISSION, joint.name)
         return "mjcf"
+
+    def _polynomial(self, zero, powers, values):
+        """(4,) factors of 1 and the powers of x - zero that hold the curve, or None."""
+        low, high = self.knots[0], self.knots[-1]
+        x = np.linspace(low, high, BETWEEN * (len(self.knots) - 1) + 1)
+        y = self.at(x, np.tile(values, (len(x), 1)))
+        for order in range(len(powers) + 1):
+            basis = lambda x: np.stack(
+                [np.ones_like(x), *(power(x - zero) for power in powers[:order])], axis=1
+            )
+            size = abs(basis(x)).max(axis=0)
+            fit = np.linalg.lstsq(basis(x) / size, y, rcond=None)[0] / size
+            if holds(lambda x: basis(x) @ fit, x, y, zero):
+                return np.pad(fit, (0, 3 - order))
+        return None
+
+
+class UnknownSurface(JointEffect):
+    """A force in the joint over two variables: its values on a grid of knots, bilinear, flat
+    beyond.
+
+    variables: two, as of Unknown. knots: the grid's lines, (m,) and (n,). Parameters: m·n forces in
+    N·m (N), those of the first line first.
+    """
+
+    name, kind, simplicity = "unknown", "joint", 3
+
+    def __init__(self, variables, knots):
+        self.variables = tuple(variables)
+        self.knots = tuple(tuple(float(x) for x in line) for line in knots)
+
+    def _key(self):
+        return self.variables, self.knots
+
+    def __eq__(self, other):
+        return isinstance(other, UnknownSurface) and self._key() == other._key()
+
+    def __hash__(self):
+        return hash(self._key())
+
+    def parameters(self, model, i):
+        M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
+        return tuple(
+            Parameter(f"force {j}, {k}", force, 0.0, -HUGE * M, HUGE * M, 0.05 * M)
+            for j in range(len(self.knots[0]))
+            for k in range(len(self.knots[1]))
+        )
+
+    def _weights(self, line, x):
+        """Cell (S,) on a line of knots, and how far in it, 0 to 1."""
+        line = np.array(line)
+        k = np.clip(np.searchsorted(line, x) - 1, 0, len(line) - 2)
+        return k, np.clip((x - line[k]) / (line[k + 1] - line[k]), 0.0, 1.0)
+
+    def force(self, models, i, values):
+        d, read, rows = models[0].jnt_dofadr[i], reader(models), np.arange(len(values))
+        grid = values.reshape(len(values), len(self.knots[0]), len(self.knots[1]))
+
+        def surface(*state):
+            (j, f), (k, g) = (
+                self._weights(line, read(variable, *state))
+                for line, variable in zip(self.knots, self.variables)
+            )
+            out = np.zeros_like(state[1])
+            for a, p in ((j, 1 - f), (j + 1, f)):
+                out[:, d] += p * ((1 - g) * grid[rows, a, k] + g * grid[rows, a, k + 1])
+            return out
+
+        return surface
+
+    def write(self, spec, model, i, values):
+        return "python"
+
+    def part(self, model, i, values):
+        forces = np.reshape(values, [len(line) for line in self.knots]).tolist()
+        knots = [list(line) for line in self.knots]
+        numbers = {"of": list(self.variables), "knots": knots, "forces": forces}
+        return Part("surface", model.joint(i).name, numbers)
+
+
+def reader(models):
+    """Function (variable, qpos, qvel, ctrl, time) -> (S,) its values; see Unknown."""
+    model, torques = models[0], {}
+
+    def read(variable, qpos, qvel, ctrl, time):
+        kind, _, name = variable.partition(":")
+        if kind == "time":
+            return time
+        if kind == "control":
+            return ctrl[:, model.actuator_ctrladr[model.actuator(name).id]]
+        joint = model.joint(name)
+        if kind == "load":
+            if name not in torques:
+                torques[name] = drive_torque(models, joint.id)
+            return torques[name](qpos, qvel, ctrl)
+        return qpos[:, joint.qposadr[0]] if kind == "position" else qvel[:, joint.dofadr[0]]
+
+    return read
+
+
+def surface(model, joint, variables, knots):
+    """Candidate for an unknown force over two variables: see UnknownSurface."""
+    effect = UnknownSurface(variables, knots)
+    return Candidate(effect, Place("joint", joint), effect.parameters(model, model.joint(joint).id))
+
+
+def holds(force, x, y, zero):
+    """Whether a function may stand for the curve of forces y (n,) at x (n,), ascending.
+
+    It has to be within 5 % of the curve, and beyond it no more than BEYOND times as large at half
+    the travel further, and in the end to push back towards zero: what has left the travel returns.
+    """
+    if abs(force(x) - y).max() > CLOSE * np.ptp(y) + 1e-12 * abs(y).max():
+        return False
+    centre, half = (x[0] + x[-1]) / 2, (x[-1] - x[0]) / 2
+    further = force(np.array([centre - 1.5 * half, centre + 1.5 * half]))
+    if abs(further).max() > BEYOND * abs(y).max():
+        return False
+    far = max(abs(x - zero).max(), 2 * half) * FAR
+    below, above = force(np.array([zero - far, zero + far]))
+    most = (1 + CLOSE) * abs(y).max()
+    return bool(below >= -most and above <= most)
 
 
 def asked(model, a, qpos, qvel, ctrl):
-    """(n,) control of an actuator on a hinge or slide; of a servo, less where it already is: its nominal force over its gain."""
+    """(n,) control of an actuator on a hinge or slide; of a servo, less where it already is: its
+    nominal force over its gain."""
     u, gain, bias = (
         ctrl[..., model.actuator_ctrladr[a]],
         model.actuator_gainprm[a, 0],
@@ -140,6 +277,7 @@ def asked(model, a, qpos, qvel, ctrl):
 
 
 def curve(model, joint, variable, knots, factor=None, wave=False):
-    """Candidate for an unknown force in a joint: see Unknown. Parameters: the force at each knot."""
+    """Candidate for an unknown force in a joint: see Unknown. Parameters: the force at each
+    knot."""
     effect = Unknown(variable, knots, factor, wave)
     return Candidate(effect, Place("joint", joint), effect.parameters(model, model.joint(joint).id))

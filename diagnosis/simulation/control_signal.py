@@ -1,15 +1,18 @@
 """A recorded control on its way to the actuator: held between rows, delayed, filtered."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from diagnosis.effects.base import end_of_step
 
 SLACK = 1e-3  # of a time step: a row this near to a step's edge is taken to lie on it
 
 
 @dataclass(frozen=True)
 class Signal:
-    """value[i] (T,) is held from time[i] to time[i+1] and seen `delay` seconds later, through a first-order `lag`.
+    """value[i] (T,) is held from time[i] to time[i+1] and seen `delay` seconds later, through a
+    first-order `lag`.
 
     Before the recording began its first control was held, and the lag at rest in it.
     """
@@ -18,15 +21,20 @@ class Signal:
     value: np.ndarray
     delay: float = 0.0
     lag: float = 0.0
+    rate: float = np.inf
 
     def sample(self, start, step, count, average):
-        """What the actuator sees in each of `count` steps of `step` seconds from time `start`, (count,).
+        """What the actuator sees in each of `count` steps of `step` seconds from time `start`,
+        (count,).
 
         A row that changes inside a step counts by its share of it, so the result is
         continuous in the delay, and what MuJoCo's linear interpolation gives. With a
-        lag: the filter's value at the end of the step (MuJoCo's actearly), or its mean
-        over the step if `average` (a Runge-Kutta step sees the filter move).
+        lag: the value at the end of the step (MuJoCo's actearly) of the filter that is as
+        late on average (see end_of_step), or the filter's mean over the step if `average`
+        (a Runge-Kutta step sees the filter move).
         """
+        if np.isfinite(self.rate):
+            return self._followed(start, step, count, average)
         edges = start - self.delay + step * np.arange(count + 1)
         first, last = self._row(edges[:-1] + SLACK * step), self._row(edges[1:] - SLACK * step)
         held = self.value[first]
@@ -35,8 +43,35 @@ class Signal:
             held = np.where(first == last, held, mean)
         if not self.lag:
             return held
+        if not average:
+            return replace(self, lag=end_of_step(self.lag, step)).filtered(edges)[1:]
         act = self.filtered(edges)
-        return held - self.lag / step * np.diff(act) if average else act[1:]
+        return held - self.lag / step * np.diff(act)
+
+    def _followed(self, start, step, count, average):
+        """As sample, of a limited rate: its mean over each step, exactly, then the lag of these."""
+        lead = 0
+        if self.lag:  # until what was before does not count any more
+            lead = int(np.ceil(min(start - self.delay - self.time[0], 40 * self.lag) / step))
+            lead = max(lead, 0)
+        edges = start - self.delay + step * np.arange(-lead, count + 1)
+        mean = np.diff(self._ramps(edges)) / step
+        if not self.lag:
+            return mean
+        steady = Signal(edges[:-1], mean, lag=self.lag)
+        return steady.sample(edges[lead], step, count, average)
+
+    def _ramps(self, t):
+        """Integral from the first row to times t of the undelayed control that follows at
+        `rate`."""
+        seconds, value = np.diff(self.time), self.value
+        level, area = np.empty(len(value)), np.zeros(len(value))
+        level[0] = value[0]
+        for k, dt in enumerate(seconds):
+            level[k + 1], gained = _ramp(level[k], value[k], dt, self.rate)
+            area[k + 1] = area[k] + gained
+        i = self._row(t)
+        return area[i] + _ramp(level[i], value[i], t - self.time[i], self.rate)[1]
 
     def _row(self, t):
         """The row that holds at times t; row 0 also before the recording."""
@@ -62,3 +97,12 @@ class Signal:
         return self.value[i] + (act[i] - self.value[i]) * np.exp(
             -np.maximum(t - self.time[i], 0.0) / self.lag
         )
+
+
+def _ramp(level, goal, seconds, rate):
+    """(level after some seconds, its integral over them) on the way to a goal at a rate; or
+    before, at rest."""
+    gap = goal - level
+    reached = np.clip(abs(gap) / rate, 0.0, np.maximum(seconds, 0.0))
+    gained = np.sign(gap) * (rate * reached**2 / 2 + abs(gap) * (np.maximum(seconds, 0) - reached))
+    return level + np.sign(gap) * rate * reached, level * seconds + gained

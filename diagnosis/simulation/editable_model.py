@@ -20,7 +20,8 @@ FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
 
 class Drive(NamedTuple):
-    """What a simulation runs on: ctrl (count, nu), qfrc (nv,), xfrc (nbody, 6); model None if MuJoCo refused it."""
+    """What a simulation runs on: ctrl (count, nu), qfrc (nv,), xfrc (nbody, 6); model None if
+    MuJoCo refused it."""
 
     model: mujoco.MjModel
     ctrl: np.ndarray
@@ -38,7 +39,8 @@ class Working:
     def __init__(self, spec, nominal, structure):
         spec, self.nominal = spec.copy(), nominal
         for body in spec.bodies[1:]:
-            # a simple body refuses a shifted centre of mass; one that only slides feels other contacts if not simple
+            # a simple body refuses a shifted centre of mass; one that only slides feels other
+            # contacts if not simple
             if nominal.body(body.name).simple[0] == ROTATES:
                 body.simple = 0
         for actuator in spec.actuators:
@@ -97,7 +99,8 @@ class Working:
         return model
 
     def drive(self, items, recording, start, step, count, memo):
-        """The Drive under items for `count` steps from time `start`. memo keeps what the drives of one call share."""
+        """The Drive under items for `count` steps from time `start`. memo keeps what the drives
+        of one call share."""
         key = id(items)
         if key not in memo:
             changed, qfrc, xfrc = {}, np.zeros(self.model.nv), np.zeros((self.model.nbody, 6))
@@ -112,7 +115,8 @@ class Working:
         return Drive(model, self.control(recording, start, step, count, changed), qfrc, xfrc, items)
 
     def control(self, recording, start, step, count, changed=()):
-        """What the actuators see in `count` steps from time `start`, (count, nu), kept for the next call.
+        """What the actuators see in `count` steps from time `start`, (count, nu), kept for the
+        next call.
 
         changed: ((actuator, ((effect, values), ...)), ...), the effects on the way to them.
         """
@@ -171,7 +175,8 @@ class Working:
         return act
 
     def _muscle(self, recording, a):
-        """Time and activation (n,) of muscle a over a recording, without delay, from its first control held for long."""
+        """Time and activation (n,) of muscle a over a recording, without delay, from its first
+        control held for long."""
         if (recording, a) not in self.muscles:
             h, m = self.nominal.opt.timestep, self.nominal
             time = np.arange(recording.time[0], recording.time[-1] + h, h)

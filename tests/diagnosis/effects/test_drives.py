@@ -1,4 +1,5 @@
-"""Physics of drives against a pendulum integrated here, by its own equations, at a hundredth of the step."""
+"""Physics of drives against a pendulum integrated here, by its own equations, at a hundredth of
+the step."""
 
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import pytest
 from plants import SIZES, arm, commanded, pendulum, stock
 
 from diagnosis.effects.drives import FrictionCurve, friction_curve
+from diagnosis.simulation.control_signal import Signal
 from diagnosis.simulation.simulator import Window, World
 
 ROWS, DT = 100, 0.01
@@ -15,7 +17,8 @@ INERTIA, WEIGHT = (
     0.025,
     0.5 * 9.81 * 0.1,
 )  # of plants.PENDULUM about its hinge; torque on it lying flat
-SERVO = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody><body><joint name="j" axis="0 1 0"/>
+SERVO = """<mujoco><option timestep="0.001" integrator="implicitfast"/>
+<worldbody><body><joint name="j" axis="0 1 0"/>
 <inertial pos="0 0 -.1" mass=".5" diaginertia=".02 .02 .02"/></body></worldbody>
 <actuator><position name="m" joint="j" kp="3" kv="0.05" forcerange="-1 1"/></actuator></mujoco>"""
 
@@ -26,7 +29,8 @@ def waves(amplitude=0.5):
 
 
 def by_hand(control, torque, level, q=0.0, v=1.0, h=1e-5):
-    """Positions (ROWS,) of the pendulum: torque(q, v, u, t) in it, dry friction up to level(q, v, drive, load).
+    """Positions (ROWS,) of the pendulum: torque(q, v, u, t) in it, dry friction up to level(q, v,
+    drive, load).
 
     Moreau's time stepping: friction stops the motion, or opposes it with all it has.
     """
@@ -93,7 +97,8 @@ def test_friction_that_depends_on_the_state(xml, torque, level, effect, values):
 
 
 def test_friction_of_the_load_holds_and_slips():
-    """Below its limit a loaded joint stands; beyond it, it moves: at 0.3 of drive and load together."""
+    """Below its limit a loaded joint stands; beyond it, it moves: at 0.3 of drive and load
+    together."""
     world, flat = pendulum(), np.pi / 2
     candidate = world.candidate("load_friction", "j")
     for torque, moves in ((0.9 * WEIGHT, False), (0.2 * WEIGHT, True), (2.5 * WEIGHT, True)):
@@ -105,7 +110,8 @@ def test_friction_of_the_load_holds_and_slips():
 
 
 def test_friction_of_several_joints_and_conditions_at_once():
-    """Each simulation of a batch has its own levels, also where one acts only for some of the time."""
+    """Each simulation of a batch has its own levels, also where one acts only for some of the
+    time."""
     world, recording = pendulum(), waves()
     loaded_, mapped_ = (world.candidate(n, "j") for n in ("load_friction", "friction_map"))
     when = {"recording": recording.name, "time": [0.3, 0.6]}
@@ -181,7 +187,8 @@ def test_bristles_bend_before_they_slip():
 
 
 def test_a_window_begins_with_the_bristle_as_it_was():
-    """What a window in the middle of a run does not show, the bend of the bristles, follows from what was recorded before."""
+    """What a window in the middle of a run does not show, the bend of the bristles, follows from
+    what was recorded before."""
     world, recording = pendulum(), waves()
     setting = {world.candidate("presliding", "j"): (0.12, 1.5)}
     windows = [Window(recording, 0, ROWS - 1)]
@@ -217,15 +224,18 @@ def test_an_elastic_joint_is_two_inertias_on_a_spring():
     np.testing.assert_allclose(there, qpos, rtol=0, atol=1e-9)
 
 
-TWO = """<mujoco><option timestep="0.001" gravity="0 0 0" integrator="implicitfast"/><worldbody><body><joint name="a" axis="0 0 1"/>
-<inertial pos="0 0 0" mass="1" diaginertia=".02 .02 .02"/><body name="wrist"><joint name="b" axis="0 0 1"/>
+TWO = """<mujoco><option timestep="0.001" gravity="0 0 0" integrator="implicitfast"/>
+<worldbody><body><joint name="a" axis="0 0 1"/>
+<inertial pos="0 0 0" mass="1" diaginertia=".02 .02 .02"/>
+<body name="wrist"><joint name="b" axis="0 0 1"/>
 <inertial pos="0 0 0" mass=".5" diaginertia=".01 .01 .01"/></body></body></worldbody>
 <actuator><motor name="ma" joint="a"/><motor name="mb" joint="b"/></actuator></mujoco>"""
 
 
 @pytest.mark.parametrize("effect, value", [("coupled_friction", 0.06), ("coupled_inertia", 0.015)])
 def test_what_two_joints_turn_together(effect, value):
-    """Two discs on one axle: M = [[.03, .01], [.01, .01]], and a rotor or dry friction in the sum of the joints."""
+    """Two discs on one axle: M = [[.03, .01], [.01, .01]], and a rotor or dry friction in the sum
+    of the joints."""
     world, h, time = World(mujoco.MjSpec.from_string(TWO)), 1e-4, np.arange(ROWS) * DT
     ctrl = 0.1 * np.stack([np.sin(9 * time), np.cos(13 * time)], axis=1)
     recording = commanded(time, ctrl, 2)
@@ -256,3 +266,74 @@ def test_what_two_joints_turn_together(effect, value):
     np.testing.assert_allclose(there, qpos, rtol=0, atol=1e-9)
     again = World(mujoco.MjSpec.from_string(xml))  # which has it already
     assert candidate not in again.candidates and world.joints(candidate.place) == {0, 1}
+
+
+def ramped(control, rate, h=1e-5):
+    """Control (n,) at every h seconds that follows the recorded one at `rate` per second at
+    most."""
+    goal, out = np.repeat(control[:-1], round(DT / h)), np.empty((ROWS - 1) * round(DT / h))
+    level = control[0]
+    for k, u in enumerate(goal):
+        level += np.clip(u - level, -rate * h, rate * h)
+        out[k] = level
+    return out
+
+
+LIMITED = {
+    "rate_limit": ((4.0,), servo),
+    "torque_speed": (
+        (0.12, 0.6),
+        lambda q, v, u, t: (lambda F: np.clip(F, *most(0.6 - 0.12 * abs(v), F * v)))(
+            servo(q, v, u, t)
+        ),
+    ),
+    "gain_fade": ((0.9,), lambda q, v, u, t: servo(q, v, u, t) * np.exp(-0.9 * t)),
+}
+
+
+def most(force, power):
+    force = max(force, 0.0) if power > 0 else np.inf
+    return -force, force
+
+
+@pytest.mark.parametrize("effect", LIMITED)
+def test_what_a_drive_cannot_give(effect):
+    """A servo whose goal is ramped, whose force falls with speed, or with time: by hand, and
+    stepwise."""
+    world, recording = World(mujoco.MjSpec.from_string(SERVO)), waves()
+    values, torque = LIMITED[effect]
+    h, steps, q, v, expected = 1e-5, round(DT / 1e-5), 0.0, 0.0, [0.0]
+    control = np.repeat(recording.ctrl[:-1, 0], steps)
+    if effect == "rate_limit":
+        control = ramped(recording.ctrl[:, 0], values[0])
+    for k, u in enumerate(control):
+        v += h / INERTIA * (torque(q, v, u, k * h) - WEIGHT * np.sin(q))
+        q += h * v
+        if (k + 1) % steps == 0:
+            expected.append(q)
+    qpos = run(world, {world.candidate(effect, "m"): values}, recording, 0.0, 0.0)
+    assert abs(qpos - expected).max() < 6e-3
+    assert abs(run(world, {}, recording, 0.0, 0.0) - expected).max() > 0.05
+
+
+def test_a_limited_rate_passes_delays_and_lags_on():
+    """Exact means over the steps, whatever these are; then late, then filtered."""
+    time = np.array([0.0, 0.1, 0.25, 0.4])
+    signal = Signal(time, np.array([0.0, 1.0, -0.5, -0.5]), rate=8.0)
+    fine = np.arange(0, 0.5, 1e-5) + 5e-6
+    level, ramp = 0.0, []
+    goal = signal.value[np.searchsorted(time, fine, side="right") - 1]
+    for u in goal:
+        level += np.clip(u - level, -8e-5, 8e-5)
+        ramp.append(level)
+    mean = np.array(ramp[:48000]).reshape(-1, 300).mean(axis=1)
+    seen = signal.sample(0.0, 0.003, len(mean), False)
+    np.testing.assert_allclose(seen, mean, atol=1e-4)
+    late = replace(signal, delay=0.006)
+    np.testing.assert_allclose(late.sample(0.006, 0.003, len(mean), False), mean, atol=1e-4)
+    slow = replace(signal, lag=0.02).sample(0.0, 0.003, len(mean), True)
+    assert (mean - slow).sum() * 0.003 == pytest.approx(
+        0.02 * (mean[-1] - 0.0), abs=1e-3
+    )  # not yet quite at rest
+    again = replace(signal, lag=0.02).sample(0.3, 0.003, 40, True)
+    np.testing.assert_allclose(again, slow[100:140], atol=1e-9)

@@ -1,5 +1,7 @@
-"""Effects: what a batch simulates is what stock MuJoCo makes of corrected.xml, and nothing at zero size."""
+"""Effects: what a batch simulates is what stock MuJoCo makes of corrected.xml, and nothing at
+zero size."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +16,8 @@ from plants import MODELS, SIZES, START, T, arm, commanded, pendulum, record, si
 
 from diagnosis.effects import EFFECTS
 from diagnosis.effects.unmodelled import asked
-from diagnosis.simulation.simulator import Window, World
+from diagnosis.simulation.corrected_py import python_parts
+from diagnosis.simulation.simulator import Case, Window, World
 
 
 @pytest.fixture(scope="module", params=MODELS)
@@ -38,7 +41,8 @@ def test_nothing_is_exactly_nominal(case):
 
 
 def test_zero_size_is_the_limit_of_small_sizes(case):
-    """What is left out at its nominal value is also what a vanishing effect tends to: no jump there."""
+    """What is left out at its nominal value is also what a vanishing effect tends to: no jump
+    there."""
     world, xml, recording = case
     expected = stock(xml, world, recording, *START)[:20]
     for candidate in world.candidates:
@@ -63,13 +67,7 @@ def test_every_effect_is_the_same_in_mjcf(case):
         assert np.isfinite(qpos).all(), candidate
         if candidate.place.kind != "sensor" and abs(qpos - predicted[0]).max() > 1e-3:
             felt.add(candidate.effect.name)
-        if candidate.effect.name == "dead_zone" and written[candidate] == "mjcf":  # a little late
-            late, size = (
-                abs(stock(corrected, world, recording, *START) - qpos)[:20],
-                abs(predicted[0] - qpos)[:20],
-            )
-            assert late.max() < 0.5 * size.max() and late.mean() < 0.5 * size.mean()
-        elif written[candidate] == "mjcf" and candidate.effect.name != "stribeck_friction":
+        if written[candidate] == "mjcf" and candidate.effect.name != "stribeck_friction":
             # Runge-Kutta reads delays and lags at its stages, here they are averaged over the step
             close = 3e-4 if candidate.effect.name in ("delay", "lag") else 1e-9
             np.testing.assert_allclose(
@@ -105,6 +103,9 @@ def test_all_effects_together_are_the_same_in_mjcf(case):
         "joint_stop",
         "load_friction",
         "friction_map",
+        "rate_limit",
+        "torque_speed",
+        "gain_fade",
     }
     setting = {
         c: SIZES[c.effect.name]
@@ -130,7 +131,8 @@ def test_all_effects_together_are_the_same_in_mjcf(case):
     ],
 )
 def test_what_is_written_by_the_time_step_is_by_the_corrected_one(kind, effect, place, values):
-    """Beside a finer time step an effect is written as into a model that had it from the beginning."""
+    """Beside a finer time step an effect is written as into a model that had it from the
+    beginning."""
     world, xml = arm(kind)
     fine = World(mujoco.MjSpec.from_string(xml.replace('timestep="0.002"', 'timestep="0.001"')))
     together = {
@@ -146,7 +148,8 @@ def test_what_is_written_by_the_time_step_is_by_the_corrected_one(kind, effect, 
 
 
 def test_stribeck_friction_in_mjcf_and_by_hand():
-    """Bristles, frictionloss with a force, and the law itself at a fine step agree through reversals and sticking."""
+    """Bristles, frictionloss with a force, and the law itself at a fine step agree through
+    reversals and sticking."""
     world, (coulomb, static, velocity) = pendulum(), (0.1, 0.2, 0.3)
     time = np.arange(100) * 0.01
     recording = commanded(time, (0.5 * np.sin(6 * time) + 0.3 * np.sin(14 * time + 1))[:, None])
@@ -201,7 +204,8 @@ def test_coulomb_friction_holds():
 
 
 def test_unknown_curves():
-    """A curve through damping's values is damping, in simulation and in MJCF; a wiggle has no MJCF form."""
+    """A curve through damping's values is damping, in simulation and in MJCF; a wiggle has no
+    MJCF form."""
     world = pendulum()
     time = np.arange(60) * 0.01
     recording = commanded(time, 0.5 * np.sin(9 * time)[:, None])
@@ -232,12 +236,102 @@ def test_unknown_curves():
         np.testing.assert_allclose(
             stock(xml, world, recording, [0.3], [0.5], 60), qpos[k], atol=2e-3
         )
-    assert world.corrected_xml({curve: tuple(np.sin(3 * knots))})[1] == {curve: "none"}
+    assert world.corrected_xml({curve: tuple(np.sin(3 * knots))})[1] == {curve: "python"}
     assert (
         curve
         == world.curve("j", "velocity:j", list(knots))
         != world.curve("j", "velocity:j", knots + 1)
     )
+
+
+@pytest.mark.parametrize(
+    "knots, forces",
+    [
+        ((-1.0, -0.5, 0.0, 0.5, 1.0), (0.5, -0.4, 0.3, -0.4, 0.5)),  # on a quartic: wiggles
+        (
+            (-1.0, -0.3, 0.2, 0.6, 1.0),
+            (-1.0, -0.3, 0.2, 0.6, 1.0),
+        ),  # pushes away, the farther the more
+        ((-1.0, 0.0, 0.3, 0.35, 1.0), (0.1, 0.1, 0.1, -0.2, -0.2)),  # a step between two knots
+    ],
+)
+def test_a_polynomial_that_runs_away_is_not_written(knots, forces):
+    """At the knots a cubic may be near: what counts is the curve between them, and beyond."""
+    world = pendulum()
+    for variable in ("position:j", "velocity:j"):
+        curve = world.curve("j", variable, knots)
+        assert world.corrected_xml({curve: forces})[1] == {curve: "python"}
+    (part,) = python_parts(world.model, {curve: forces})
+    assert part.numbers["knots"] == list(knots) and part.numbers["forces"] == list(forces)
+
+
+def test_what_is_written_of_a_curve_stays_near_it():
+    """Between the knots and half the travel beyond: in stock MuJoCo, by the joint's own force."""
+    world, knots = pendulum(), np.linspace(-0.8, 1.2, 5)
+    for variable in ("position", "velocity"):
+        values = tuple(0.2 - 0.3 * knots - 0.1 * knots**3)
+        curve = world.curve("j", f"{variable}:j", knots)
+        xml, written = world.corrected_xml({curve: values})
+        assert written == {curve: "mjcf"}
+        models = [mujoco.MjModel.from_xml_string(x) for x in (xml, world.corrected_xml({})[0])]
+        for x in np.linspace(-1.3, 1.7, 31):
+            forces = []
+            for model in models:
+                data = mujoco.MjData(model)
+                data.qpos[0], data.qvel[0] = (x, 0.0) if variable == "position" else (0.0, x)
+                mujoco.mj_forward(model, data)
+                forces.append(data.qfrc_smooth[0])
+            flat = np.interp(x, knots, values)
+            inside = knots[0] <= x <= knots[-1]
+            assert abs(forces[0] - forces[1] - flat) < (0.06 if inside else 0.6)
+
+
+def test_inertias_that_were_seen_are_written_as_they_are():
+    """The triangle inequality moves what did not show; where all did and none is a body's, nothing is written."""
+    world = World(mujoco.MjSpec.from_string(BODY))
+    candidate = world.candidate("inertia", "b")
+    effect, nominal = candidate.effect, candidate.nominal
+    for seen, x in itertools.product(range(3), (0.2, 0.7, 1.6, 5.0)):
+        values = list(nominal)
+        values[seen] *= x
+        xml, written = world.corrected_xml({candidate: tuple(values)})
+        there = mujoco.MjModel.from_xml_string(xml).body("b").inertia
+        assert written == {candidate: "mjcf"} and there[seen] == values[seen]
+        assert 2 * there.max() <= there.sum() * (1 + 1e-9)
+    both = (0.4 * nominal[0], 3 * nominal[1], nominal[2])  # two seen, the third follows
+    there = mujoco.MjModel.from_xml_string(world.corrected_xml({candidate: both})[0]).body("b")
+    np.testing.assert_array_equal(there.inertia[:2], both[:2])
+    none = (0.9 * nominal[0], 0.9 * nominal[1], 5 * nominal[2])
+    xml, written = world.corrected_xml({candidate: none})
+    assert written == {candidate: "none"} and not effect.possible(none, nominal)
+    np.testing.assert_allclose(mujoco.MjModel.from_xml_string(xml).body("b").inertia, nominal)
+
+
+def test_what_does_not_show_goes_back():
+    """An unseen moment that a fit drove away returns, as near to its nominal value as the seen one allows."""
+    world = World(mujoco.MjSpec.from_string(BODY))
+    candidate = world.candidate("inertia", "b")
+    effect, i, nominal = candidate.effect, world.model.body("b").id, candidate.nominal
+    seen = (False, True, False)
+    back = effect.unseen(world.model, i, (0.01, 1.2 * nominal[1], 1e-7), seen)
+    assert back == (nominal[0], 1.2 * nominal[1], nominal[2])
+    back = effect.unseen(world.model, i, (0.01, 9 * nominal[1], 1e-7), seen)
+    assert back[1] == 9 * nominal[1] and 2 * max(back) <= sum(back) * (1 + 1e-9)
+    gravity = world.candidate("gravity", "world")
+    back = gravity.effect.unseen(world.model, 0, (30.0, 0.1, -9.0), (False, True, True))
+    assert back == (0.0, 0.1, -9.0)
+
+
+BODY = """<mujoco><worldbody><body name="b"><joint name="j" axis="0 1 0"/>
+<inertial pos="0 0 -.1" mass=".5" diaginertia=".002 .003 .0035"/></body></worldbody></mujoco>"""
+
+
+def test_motors_with_dead_zones_run_in_one_go():
+    """Only a servo's is a force that depends on the state, to be worked out step by step."""
+    for kind, stepwise in (("motors", False), ("servos", True)):
+        world, _ = arm(kind)
+        setting = {world.candidate("dead_zone", "bend"): (0.4,)}
+        assert Case(world.model, setting, 1).stepwise == stepwise
 
 
 def test_what_actuators_are_asked_is_their_force_over_their_gain():

@@ -7,6 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from plants import ARM, DT, MODELS, SIZES, START, T, arm, commanded, pendulum, record, simulate
 
+from diagnosis.effects.base import end_of_step
 from diagnosis.simulation.control_signal import Signal
 from diagnosis.simulation.simulator import Window, World
 
@@ -31,19 +32,34 @@ def test_signal_against_a_plain_loop(seed, delay, lag):
     start, step, count, fine = time[4], 0.002, 10, 1e-6
     t = np.arange(time[0] - fine, start + step * count, fine) + fine / 2
     u = value[np.maximum(np.searchsorted(time, t - delay, side="right") - 1, 0)]
-    act = np.empty_like(u)
-    level, stays = value[0], np.exp(-fine / lag) if lag else 0.0
-    for k in range(len(u)):
-        level = act[k] = u[k] + (level - u[k]) * stays
+
+    def filtered(lag):
+        act, level, stays = np.empty_like(u), value[0], np.exp(-fine / lag) if lag else 0.0
+        for k in range(len(u)):
+            level = act[k] = u[k] + (level - u[k]) * stays
+        return act
+
+    act = filtered(lag)
     inside = [(t >= start + step * k) & (t < start + step * (k + 1)) for k in range(count)]
     signal = Signal(time, value, delay, lag)
     np.testing.assert_allclose(
         signal.sample(start, step, count, True), [act[i].mean() for i in inside], atol=0.03
     )
     if lag:
+        act = filtered(end_of_step(lag, step))
         np.testing.assert_allclose(
             signal.sample(start, step, count, False), [act[i][-1] for i in inside], atol=0.03
         )
+
+
+@pytest.mark.parametrize("average", [False, True])
+@pytest.mark.parametrize("lag", [0.0005, 0.002, 0.03])
+def test_a_lag_is_as_late_as_it_says(lag, average):
+    """Behind a step of the control by 1 for `lag` seconds in all, whatever the time step."""
+    signal = Signal(np.array([0.0, 0.1, 1.0]), np.array([0.0, 1.0, 1.0]), lag=lag)
+    for step in (0.0005, 0.002, 0.01):
+        seen = signal.sample(0.1, step, round(0.8 / step), average)
+        assert (1 - seen).sum() * step == pytest.approx(lag, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,276 @@
+"""corrected.py: a script beside corrected.xml that adds what MJCF cannot hold, with numpy and
+mujoco alone.
+
+parts = python_parts(world.model, setting)              # [] where corrected.xml alone holds the
+setting
+write_corrected_py("report/corrected.py", "report/corrected.xml", parts, joints)
+rows = predictions("report/corrected.py", windows, world.model)      # in a process of its own
+env_batch = BatchCorrections(batch, parts); env_batch.step(nstep=5)  # many environments at once
+
+The script is diagnosis/simulation/corrected_template.py with the laws that are needed, and the
+numbers.
+"""
+
+import ast
+import os
+import pprint
+import subprocess
+import sys
+import tempfile
+import types
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from diagnosis.common.atomic_files import write_whole
+from diagnosis.effects import EFFECTS
+from diagnosis.effects.actuators import actuator_force
+from diagnosis.simulation import corrected_template
+
+TEMPLATE = Path(corrected_template.__file__)
+TABLES = ("FRICTION", "FORCE", "DRIVE", "CONTROL")
+SECONDS = 600.0  # a prediction may take
+
+
+class ScriptError(ValueError):
+    """A corrected.py that does not run. One line: which, and what it said."""
+
+
+def python_parts(model, setting, written=None):
+    """The Parts of a setting {Candidate: values} for corrected.py, in the order of the catalogue.
+
+    model: the nominal MjModel. written: where each effect is held, as World.corrected_xml told;
+    without
+    it every effect with a part counts. What acts under a condition has no part.
+    """
+    order = {effect: k for k, effect in enumerate(EFFECTS)}
+    parts = []
+    for candidate, values in sorted(
+        setting.items(), key=lambda item: order.get(item[0].effect, len(order))
+    ):
+        left = written is None or written.get(candidate) == "python"
+        if left and not candidate.when and tuple(values) != candidate.nominal:
+            i = candidate.effect.id(model, candidate.place.name)
+            part = candidate.effect.part(model, i, values)
+            parts += [part] if part else []
+    return parts
+
+
+def xml_holds(written):
+    """Whether corrected.xml alone holds a setting: written as World.corrected_xml told,
+    {Candidate: form}."""
+    return all(form != "python" for form in written.values())
+
+
+def corrected_py(parts, joints, xml_name="corrected.xml"):
+    """The script's text: for Parts, the names of the recorded joints in order, and the MJCF file
+    beside it."""
+    source = TEMPLATE.read_text(encoding="utf-8")
+    used = {part.law for part in parts}
+    unknown = used - set().union(*(getattr(corrected_template, table) for table in TABLES))
+    if unknown:
+        raise ValueError(f"corrected.py has no law {sorted(unknown)[0]!r}")
+    replaced = {
+        "XML": f"XML = Path(__file__).with_name({xml_name!r})",
+        "JOINTS": _literal("JOINTS", list(joints)),
+        "PARTS": _literal("PARTS", [tuple(part) for part in parts]),
+    }
+    for table in TABLES:
+        laws = [law for law in getattr(corrected_template, table) if law in used]
+        names = ", ".join(laws) + ("," if len(laws) == 1 else "")
+        whole = f"{table} = {{f.__name__: f for f in ({names})}}"
+        replaced[table] = whole if laws else f"{table} = {{}}"
+    return _pruned(source, replaced)
+
+
+def _literal(name, value):
+    """An assignment that reads well."""
+    return f"{name} = " + pprint.pformat(value, width=96 - len(name), sort_dicts=False)
+
+
+def _pruned(source, replaced):
+    """The source with statements {name: text} exchanged, and functions that nothing mentions any
+    more left out."""
+    tree, lines = ast.parse(source), source.splitlines()
+    blocks, end = [], 0  # (name or None, what stands above it, text)
+    for node in tree.body:
+        name = getattr(node, "name", None)
+        if isinstance(node, ast.Assign):
+            name = getattr(node.targets[0], "id", None)
+        above, text = (
+            lines[end : node.lineno - 1],
+            "\n".join(lines[node.lineno - 1 : node.end_lineno]),
+        )
+        text = replaced.get(name, text)
+        blocks.append([name, above, text, isinstance(node, ast.FunctionDef)])
+        end = node.end_lineno
+    laws = {law for table in TABLES for law in getattr(corrected_template, table)}
+    helpers = {"variable", "asked", "factor_of", "drive", "drives"}
+    while True:
+        texts = [b[2] for b in blocks]
+        mentioned = set()
+        for block, text in zip(blocks, texts):
+            names = {n.id for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Name)}
+            mentioned |= names - {block[0]}
+        gone = [b for b in blocks if b[3] and b[0] in laws | helpers and b[0] not in mentioned]
+        if not gone:
+            break
+        for block in gone:  # a heading above it stays for the next function, if it has none
+            following = blocks[blocks.index(block) + 1]
+            if following[3] and not any(line.startswith("#") for line in following[1]):
+                following[1] = block[1]
+            blocks.remove(block)
+    out = [line for block in blocks for line in (*block[1], block[2])]
+    return "\n".join(out) + "\n"
+
+
+def write_corrected_py(path, xml_path, parts, joints):
+    """Write the script for Parts to path, for the MJCF at xml_path in the same folder. Raises
+    WriteError."""
+    write_whole(path, corrected_py(parts, joints, Path(xml_path).name))
+
+
+RUNNER = """
+import importlib.util, sys, numpy as np
+spec = importlib.util.spec_from_file_location("corrected", sys.argv[1])
+script = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(script)
+model, given, out = script.load()[0], np.load(sys.argv[2], allow_pickle=False), {}
+for k in range(int(given["count"])):
+    row = {name: given[f"{name}{k}"] for name in ("time", "qpos", "qvel", "ctrl", "windows")}
+    for number, qpos in zip(given[f"numbers{k}"], script.predict(model, **row)):
+        out[str(number)] = qpos
+np.savez(sys.argv[3], **out)
+"""
+
+
+def predictions(script, windows, model):
+    """What a corrected.py predicts in Windows, [(rows, nq)], worked out by importing it in
+    another process.
+
+    model: the nominal MjModel, whose coordinates the recordings have. Velocities that were not
+    measured
+    are differences of the rows around. Raises ScriptError.
+    """
+    recordings = list(dict.fromkeys(w.recording for w in windows))
+    given = {"count": len(recordings)}
+    for k, recording in enumerate(recordings):
+        own = [n for n, w in enumerate(windows) if w.recording is recording]
+        rows = [(windows[n].first, windows[n].last) for n in own]
+        velocity = np.where(
+            np.isfinite(recording.qvel), recording.qvel, _differences(model, recording)
+        )
+        arrays = recording.time, recording.qpos, velocity, recording.ctrl, rows, own
+        names = "time", "qpos", "qvel", "ctrl", "windows", "numbers"
+        given |= {f"{name}{k}": np.asarray(array) for name, array in zip(names, arrays)}
+    with tempfile.TemporaryDirectory() as folder:
+        there, back = os.path.join(folder, "given.npz"), os.path.join(folder, "out.npz")
+        np.savez(there, **given)
+        command = [sys.executable, "-I", "-c", RUNNER, os.path.abspath(script), there, back]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=SECONDS, cwd=folder, check=False
+            )
+        except subprocess.TimeoutExpired:
+            raise ScriptError(f"{script}: no prediction within {SECONDS:.0f} s") from None
+        if done.returncode:
+            said = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+            raise ScriptError(f"{script} does not run: {said}")
+        with np.load(back, allow_pickle=False) as out:
+            return [out[str(n)] for n in range(len(windows))]
+
+
+def _differences(model, recording):
+    """Central differences (T, nv) of a Recording's positions."""
+    count, out = len(recording.time), np.full((len(recording.time), model.nv), np.nan)
+    for k in range(count):
+        a, b = max(k - 1, 0), min(k + 1, count - 1)
+        if b > a:
+            seconds = recording.time[b] - recording.time[a]
+            mujoco.mj_differentiatePos(model, out[k], seconds, recording.qpos[a], recording.qpos[b])
+    return out
+
+
+def module_of(parts, joints=()):
+    """The script as a module, with its functions; nothing is written."""
+    module = types.ModuleType("corrected")
+    module.__file__ = str(TEMPLATE)
+    exec(compile(corrected_py(parts, joints), "corrected.py", "exec"), module.__dict__)
+    return module
+
+
+class BatchLook:
+    """What the laws see of all the simulations of a mujoco Batch: as corrected_template.Look,
+    arrays (nsim,)."""
+
+    def __init__(self, batch, forces):
+        self.batch, self.model, self._forces = batch, batch.model, forces
+        self.time, self.step = batch.bind("time").copy(), batch.model.opt.timestep
+        names = ("qpos", "qvel", "ctrl", "qfrc_bias")
+        self._state = {name: batch.bind(name) for name in names}
+
+    def position(self, joint):
+        return self._state["qpos"][:, self.model.joint(joint).qposadr[0]]
+
+    def velocity(self, joint):
+        return self._state["qvel"][:, self.model.joint(joint).dofadr[0]]
+
+    def bias(self, joint):
+        return self._state["qfrc_bias"][:, self.model.joint(joint).dofadr[0]]
+
+    def force(self, actuator):
+        state = (self._state[name] for name in ("qpos", "qvel", "ctrl"))
+        return self._forces[actuator](*state)
+
+    def control(self, actuator):
+        u = self.model.actuator_ctrladr[self.model.actuator(actuator).id]
+        limited, value = self.model.actuator_ctrllimited[u], self._state["ctrl"][:, u]
+        return np.clip(value, *self.model.actuator_ctrlrange[u]) if limited else value
+
+
+class BatchCorrections:
+    """Steps a mujoco Batch of corrected.xml with what corrected.py adds.
+
+    batch: it gets a dof_frictionloss of each simulation's own. Raises ValueError for actuators
+    with a
+    delay or a filter, whose force a batch does not tell before the step.
+    """
+
+    def __init__(self, batch, parts):
+        self.batch, self.parts = batch, list(parts)
+        self.module, self.memory = module_of(self.parts), {}
+        model = batch.model
+        joined = [
+            a
+            for a in np.flatnonzero(model.actuator_ctrlnum == 1)
+            if model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        ]
+        late = [a for a in joined if model.actuator_delay[a] > 0 or model.actuator_actadr[a] >= 0]
+        if late and self.parts:
+            name = model.actuator(late[0]).name
+            raise ValueError(f"actuator {name}: a delay or filter beside what corrected.py adds")
+        self._forces = {model.actuator(a).name: actuator_force([model], a) for a in joined}
+        self._loss = batch.expand("dof_frictionloss") if self.parts else None
+        self._least = model.dof_frictionloss.copy()
+
+    def step(self, ids=None, nstep=1):
+        """As Batch.step, with the corrections worked out at the beginning of each step."""
+        batch = self.batch
+        if not self.parts:
+            batch.step(ids, nstep=nstep)
+            return
+        ctrl, pushed = batch.bind("ctrl"), batch.bind("qfrc_applied")
+        for _ in range(nstep):
+            wanted, before = ctrl.copy(), pushed.copy()
+            look = BatchLook(batch, self._forces)
+            ctrl[:] = self.module.controls(batch.model, look, wanted, self.memory)
+            batch.forward(ids, int(mujoco.mjtStage.mjSTAGE_VEL))
+            force, level = self.module.corrections(batch.model, look)
+            for dof, value in force:
+                pushed[:, dof] += value
+            self._loss[:] = self._least
+            for dof, value in level:
+                self._loss[:, dof] += value
+            batch.step(ids)
+            ctrl[:], pushed[:] = wanted, before

@@ -1,0 +1,263 @@
+"""corrected.py: what the script makes of corrected.xml is what the simulator predicts, in a
+process of its own."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch
+from plants import DT, SIZES, START, T, arm, commanded, pendulum, record, simulate
+
+from diagnosis.effects.base import Part
+from diagnosis.effects.drives import friction_curve
+from diagnosis.effects.unmodelled import surface
+from diagnosis.simulation.corrected_py import (
+    BatchCorrections,
+    ScriptError,
+    corrected_py,
+    module_of,
+    predictions,
+    python_parts,
+    write_corrected_py,
+    xml_holds,
+)
+from diagnosis.simulation.simulator import Window, World
+
+AXES = "position:elbow", "velocity:swing"
+ROWS = 45  # of the recording, in the script
+JOINTS = ["lift", "swing", "elbow"]
+OF_DRIVES = {
+    "load_friction",
+    "friction_map",
+    "dead_zone",
+    "rate_limit",
+    "torque_speed",
+    "gain_fade",
+}
+
+
+def curves(world):
+    """Settings of forces and friction without a name, with knots well inside the travel and its
+    speeds."""
+    make = world.curve
+    grid = np.array([[0.2, -0.1, 0.3], [0.0, 0.4, -0.2]])
+    return [
+        {make("elbow", "position:elbow", (-0.4, -0.3, 0.1)): (0.3, -0.3, 0.2)},
+        {make("elbow", "velocity:swing", (-0.5, 0.0, 0.3)): (0.3, 0.0, -0.2)},
+        {make("elbow", "control:bend", (-1.0, 0.0, 0.5)): (0.1, 0.0, -0.3)},
+        {make("elbow", "load:swing", (-1.0, 0.0, 0.5)): (0.1, 0.0, -0.3)},
+        {make("swing", "time", (0.1, 0.3, 0.4)): (0.1, 0.5, -0.3)},
+        {make("elbow", "time", (0.1, 0.3), "control:bend"): (0.1, -0.2)},
+        {make("elbow", "position:elbow", (-0.4, 0.1), "velocity:elbow"): (-0.1, -0.2)},
+        {make("elbow", "time", (0.0, 0.05), wave=True): (0.3, 0.2)},
+        {
+            surface(
+                world.model,
+                "elbow",
+                ("position:elbow", "velocity:swing"),
+                ((-0.35, -0.2), (-0.6, 0, 0.4)),
+            ): tuple(grid.ravel())
+        },
+        {friction_curve(world.model, "elbow", (-0.4, -0.3, 0.1)): (0.3, 0.0, 0.2)},
+    ]
+
+
+def script_of(folder, world, setting):
+    xml, written = world.corrected_xml(setting)
+    parts = python_parts(world.model, setting, written)
+    (folder / "corrected.xml").write_text(xml)
+    write_corrected_py(folder / "corrected.py", folder / "corrected.xml", parts, JOINTS)
+    return parts, written
+
+
+def in_script(folder, parts, recording, rows=ROWS):
+    """Positions by the script's rollout, from its own file."""
+    module = module_of(parts, JOINTS)
+    model, _ = module.load(folder / "corrected.xml")
+    start = START if model.nq == 3 else ([START[0][0]], [START[1][0]])
+    ctrl, time = recording.ctrl[:rows], recording.time[:rows]
+    return module.rollout(model, *(np.array([x]) for x in start), ctrl[None], time)[0][0]
+
+
+@pytest.mark.parametrize("kind", ["motors", "servos", "rk4"])
+def test_the_script_is_the_simulator(tmp_path, kind):
+    """Every law, inside and beyond its knots, to the rounding of the solver."""
+    world, _ = arm(kind)
+    recording, named = record(world), []
+    for candidate in world.candidates:
+        if candidate.effect.name in OF_DRIVES:
+            named.append({candidate: SIZES[candidate.effect.name]})
+    settings = named + (curves(world) if kind != "rk4" else [])
+    nominal = simulate(world, [{}], recording, ROWS)[0]
+    for setting, expected in zip(settings, simulate(world, settings, recording, ROWS)):
+        parts, written = script_of(tmp_path, world, setting)
+        assert set(written.values()) == {"python"} and len(parts) == 1 and not xml_holds(written)
+        qpos = in_script(tmp_path, parts, recording)
+        np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9, err_msg=str(parts))
+        assert abs(expected - nominal).max() > 1e-4, parts
+
+
+def test_several_at_once_and_beside_what_mjcf_holds(tmp_path):
+    world, _ = arm("motors")
+    recording = record(world)
+    places = {
+        "load_friction": "elbow",
+        "friction_map": "swing",
+        "dead_zone": "bend",
+        "delay": "bend",
+        "gain": "bend",
+        "mass": "fore",
+        "coulomb_friction": "elbow",
+    }
+    setting = {world.candidate(name, place): SIZES[name] for name, place in places.items()}
+    setting |= curves(world)[0]
+    setting[world.candidate("delay", "bend")] = (0.006,)  # whole steps: as load friction sees it
+    parts, written = script_of(tmp_path, world, setting)
+    assert sorted(p.law for p in parts) == ["curve", "dead_zone", "friction_wave", "load_friction"]
+    assert {c.effect.name for c, form in written.items() if form == "mjcf"} == {
+        "delay",
+        "gain",
+        "mass",
+        "coulomb_friction",
+    }
+    expected = simulate(world, [setting], recording, ROWS)[0]
+    qpos = in_script(tmp_path, parts, recording)
+    np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9)
+
+
+def test_a_setting_that_mjcf_holds_needs_no_script():
+    world, _ = arm("motors")
+    setting = {world.candidate("coulomb_friction", "elbow"): (0.1,)}
+    written = world.corrected_xml(setting)[1]
+    assert xml_holds(written) and python_parts(world.model, setting, written) == []
+    assert xml_holds({}) and python_parts(world.model, setting) == []
+
+
+def test_predictions_of_windows_in_a_process_of_its_own(tmp_path):
+    """Windows inside a run go on where it was: delayed controls, ramps, bristles that nothing
+    recorded."""
+    world, _ = arm("motors")
+    recording = record(world)
+    setting = {
+        world.candidate("load_friction", "elbow"): SIZES["load_friction"],
+        world.candidate("rate_limit", "bend"): (4.0,),
+        world.candidate("presliding", "swing"): (0.15, 3.0),
+    }
+    script_of(tmp_path, world, setting)
+    start = [x[None] for x in START]
+    q, v = (x[0] for x in world.simulate([setting], *start, [Window(recording, 0, T - 1)]))
+    run = replace(recording, qpos=q, qvel=v)
+    windows = [Window(run, 0, 12), Window(run, 30, T - 1), Window(run, 20, 25)]
+    rows = predictions(tmp_path / "corrected.py", windows, world.model)
+    for window, qpos in zip(windows, rows):
+        expected = q[window.first : window.last + 1]
+        assert qpos.shape == expected.shape
+        np.testing.assert_allclose(qpos, expected, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(rows[0], q[:13], rtol=0, atol=1e-9)
+    unmeasured = replace(run, qvel=np.full_like(v, np.nan))
+    (rough,) = predictions(tmp_path / "corrected.py", [Window(unmeasured, 20, 25)], world.model)
+    assert 0 < abs(rough - q[20:26]).max() < 0.1
+
+
+def test_the_script_stands_alone(tmp_path):
+    """It imports numpy and mujoco, runs with neither our package nor its folder on the path, and
+    is short."""
+    world = pendulum()
+    setting = {world.candidate("load_friction", "j"): (0.2, 0.3, 1.0)}
+    xml, written = world.corrected_xml(setting)
+    text = corrected_py(python_parts(world.model, setting, written), ["j"])
+    for absent in ("diagnosis", "gain_fade", "def surface", "def asked"):
+        assert absent not in text
+    assert max(map(len, text.splitlines())) <= 100
+    (tmp_path / "corrected.xml").write_text(xml)
+    (tmp_path / "corrected.py").write_text(text)
+    code = """import sys; sys.path.insert(0, '.'); import corrected as c
+m, d = c.load(); d.ctrl[:] = 1.0; c.step(m, d, 50); print(float(d.qpos[0]))"""
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    time = 0.001 * np.arange(51)
+    run = commanded(time, np.ones((51, 1)))
+    qpos = world.simulate([setting], [[0.0]], [[0.0]], [Window(run, 0, 50)])[0]
+    assert float(done.stdout) == pytest.approx(qpos[0, -1, 0], abs=1e-9)
+
+
+def test_as_a_callback(tmp_path):
+    """In mj_step itself, and with the controls that were asked for left to the caller's next
+    ones."""
+    world, _ = arm("servos")
+    recording = record(world)
+    places = {"load_friction": "elbow", "dead_zone": "bend", "friction_map": "swing"}
+    setting = {world.candidate(name, place): SIZES[name] for name, place in places.items()}
+    parts, _ = script_of(tmp_path, world, setting)
+    module = module_of(parts, JOINTS)
+    model, data = module.load(tmp_path / "corrected.xml")
+    module.install(model)
+    try:
+        data.qpos[:], data.qvel[:] = START
+        out = [data.qpos.copy()]
+        for u in recording.ctrl[:-1]:
+            data.ctrl[:] = u
+            mujoco.mj_step(model, data, round(DT / model.opt.timestep))
+            out.append(data.qpos.copy())
+    finally:
+        mujoco.set_mjcb_control(None)
+    expected = simulate(world, [setting], recording)[0]
+    np.testing.assert_allclose(out, expected, rtol=0, atol=1e-7)
+
+
+def test_a_ramp_within_a_callback_begins_anew_with_each_run():
+    module = module_of([Part("rate_limit", "m", {"rate": 2.0})], ["j"])
+    model = pendulum().model
+    data = mujoco.MjData(model)
+    for _ in range(2):
+        mujoco.mj_resetData(model, data)
+        data.ctrl[0] = 0.0
+        module.step(model, data)
+        data.ctrl[0] = 1.0
+        module.step(model, data, 100)
+        look = module.Look(model, data)
+        seen = module.controls(model, look, data.ctrl, module.MEMORY[id(data)])
+        assert seen[0] == pytest.approx(2.0 * 0.1005, abs=1e-9)  # its mean over the next step
+        assert data.ctrl[0] == 1.0
+
+
+def test_many_environments_at_once(tmp_path):
+    world, _ = arm("motors")
+    recording = record(world)
+    places = {"load_friction": "elbow", "dead_zone": "bend", "torque_speed": "swing"}
+    places["torque_speed"] = next(
+        c.place.name for c in world.candidates if c.effect.name == "torque_speed"
+    )
+    setting = {world.candidate(name, place): SIZES[name] for name, place in places.items()}
+    xml, written = world.corrected_xml(setting)
+    batch = Batch(mujoco.MjModel.from_xml_string(xml), 3, 1)
+    corrections = BatchCorrections(batch, python_parts(world.model, setting, written))
+    qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+    qpos[:], qvel[:] = START
+    qpos[1] += 0.01
+    for u in recording.ctrl[:-1]:
+        ctrl[:] = u
+        corrections.step(nstep=round(DT / batch.model.opt.timestep))
+        np.testing.assert_array_equal(ctrl, np.tile(u, (3, 1)))
+    expected = simulate(world, [setting], recording)[0]
+    np.testing.assert_allclose(qpos[[0, 2]], np.tile(expected[-1], (2, 1)), rtol=0, atol=1e-8)
+    assert abs(qpos[1] - qpos[0]).max() > 1e-4
+    late = World(mujoco.MjSpec.from_string(xml))
+    delayed = late.corrected_xml({late.candidate("delay", "bend"): (0.01,)})[0]
+    with pytest.raises(ValueError, match="bend: a delay or filter"):
+        BatchCorrections(Batch(mujoco.MjModel.from_xml_string(delayed), 1, 1), corrections.parts)
+
+
+def test_a_script_that_does_not_run_is_one_line(tmp_path):
+    world = pendulum()
+    window = Window(commanded(np.arange(3) * 0.01, np.zeros((3, 1))), 0, 2)
+    (tmp_path / "corrected.py").write_text(corrected_py([], ["j"]))  # no corrected.xml beside it
+    with pytest.raises(ScriptError, match="does not run") as error:
+        predictions(tmp_path / "corrected.py", [window], world.model)
+    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="no law 'magic'"):
+        corrected_py([Part("magic", "j", {})], ["j"])
