@@ -33,6 +33,7 @@ from diagnosis.recordings import recording as recorded
 from diagnosis.recordings.cleaning import without_defects
 from diagnosis.recordings.column_map import load_layout
 from diagnosis.recordings.layout import Layout
+from diagnosis.recordings.quality import assess, told
 from diagnosis.report import text as wording
 from diagnosis.report import writer
 
@@ -73,10 +74,11 @@ def diagnose(
     layout = load_layout(columns, degrees, frozenset(gains))
     train, held = _recordings(recordings, held_out, world.model, layout)
     world = with_gains(world, together(gains, train + held))
-    given, notes = without_defects(train + held, world.model)
+    assessed = [dataclasses.replace(r, quality=assess(r, world.model)) for r in train + held]
+    given, notes = without_defects(assessed, world.model)
     train, held = given[: len(train)], given[len(train) :]
     notes += plausibility.check(given, world.model)
-    notes += _runs(world.model, given)
+    notes += _runs(world.model, given) + told(given, world.model)
     if not held:
         train, held = split(train)
     plausibility.enough(train)

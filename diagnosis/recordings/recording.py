@@ -40,7 +40,8 @@ class Recording:
     absent; ctrl (T, nu), without NaN; sensors: name -> (T, k). start: the row from which on it is
     predicted where it is held out; those before only say what led there, such as controls that are
     still on their way. gains: {joint: {"kp", "kd"}} of the controllers whose targets the controls
-    are, where the file says so. notes: what its reader found odd, one line each.
+    are, where the file says so. notes: what its reader found odd, one line each. quality: what was
+    done to it before (quality.Quality), once that was looked at.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Recording:
     start: int = 0
     gains: dict = field(default_factory=dict)
     notes: tuple = ()
+    quality: object = None
 
     def seen(self):
         """The rows from `start` on, as a Recording of their own."""
