@@ -312,7 +312,7 @@ def test_the_function_reads_as_the_command_does(command):
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_progress_is_for_terminals(terminal, tmp_path, capsys, monkeypatch):
-    def stop(model, recordings, held_out, progress):
+    def stop(model, recordings, held_out, progress, **reading):
         assert (progress is not None) == terminal
         if progress:
             progress(0.25, "estimating noise")
@@ -330,7 +330,7 @@ def test_progress_is_for_terminals(terminal, tmp_path, capsys, monkeypatch):
 
 
 def test_a_fault_of_the_program_is_one_line_too(tmp_path, capsys, monkeypatch):
-    def break_down(*args):
+    def break_down(*args, **reading):
         raise np.linalg.LinAlgError("Singular\nmatrix")
 
     monkeypatch.setattr(diagnose, "diagnose", break_down)
@@ -366,7 +366,7 @@ def test_a_terminal_that_cannot_show_a_sign(command):
             "types, json; "
             "s = json.load(open('report/diagnosis.json')); command.writer.write = lambda *a: "
             "['unknown_1.csv']; "
-            "command.diagnose = lambda *a: types.SimpleNamespace(summary=s); "
+            "command.diagnose = lambda *a, **k: types.SimpleNamespace(summary=s); "
             "sys.exit(command.main(['--model', 'sim.xml', '--recordings', 'run0.csv', '--out', "
             "'x']))",
             ROOT,
@@ -495,7 +495,7 @@ def test_error_in_words():
             "qpos:elbow": {"before": 0.031, "after": 0.002, "floor": 0.001, "unit": "rad"},
         },
     }
-    summary = {"verdict": "mismatch", "fit": {"held_out": fit}}
+    summary = {"verdict": "mismatch", "findings": [{}], "fit": {"held_out": fit}}
     assert wording.error_words(summary) == (
         "held-out error 0.3 s ahead falls from 31 to 2.0 mrad at elbow; "
         "a perfect simulator would show 1.0, for it too starts from noisy measurements"
