@@ -53,6 +53,15 @@ def conforms(value, schema, where="$"):
         )
 
 
+def strict(path):
+    """What a JSON file holds; NaN and infinity are refused, as other programs do."""
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+
+
 def validator():
     """A validator by the schema file of format 2."""
     schema = json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))

@@ -1,0 +1,34 @@
+"""Findings: knots of curves and numbers where the contract has numbers, shares of errors."""
+
+import mujoco
+import numpy as np
+from malformed import ARM, arm
+
+from diagnosis import findings
+from diagnosis.effects import unmodelled
+from diagnosis.simulation.simulator import World
+
+
+def test_findings_tell_where_a_curve_has_its_knots_and_keep_numbers():
+    stop, curve = (
+        World(mujoco.MjSpec.from_string(ARM)).candidate("joint_stop", "shoulder"),
+        unmodelled.curve(arm(), "elbow", "time", (0.0, 2.0, 3.0)),
+    )
+    assert [p["at"] for p in findings.parameters_of(curve, (1.0, 2.0, 3.0))] == [0.0, 2.0, 3.0]
+    assert [p["value"] for p in findings.parameters_of(stop, (-np.inf, 0.5))] == [-1e6, 0.5]
+    inf = np.inf
+    assert [
+        findings.removed(*errors)
+        for errors in ((3, 1, 4), (inf, 1, inf), (inf, 1, 4), (3, inf, 4), (inf, inf, inf))
+    ] == [0.5, 1, 1, -1, 0]
+    assert [
+        findings.unexplained(*errors)
+        for errors in (
+            (10, 1, 1, 0),
+            (inf, inf, 1, 1),
+            (inf, 2, 1, 1),
+            (2, inf, 1, 1),
+            (10, 6, 4, 0),
+            (10, 6, 4, 5),
+        )
+    ] == [0, 1, 0, 1, 0.2, 0.1]
