@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.recordings.columns import WIDTHS, RecordingError, columns_of
+from diagnosis.recordings.layout import is_servo, joint_of
 from diagnosis.recordings.unit_check import suspect
 
 HIGH, FAST = (
@@ -40,6 +41,7 @@ def check(recordings, model):
         _check_time(recording, model, warn)
         _check_values(recording, model, warn)
         _check_rates(recording, model, warn)
+        _check_targets(recording, model)
         _check_overlap(recording, model, warn)
     moving = enough(recordings)
     for recording in recordings:
@@ -395,6 +397,27 @@ def _paths(recording, model):
             part = f":{k}" if model.jnt_type[j] == 0 else ""
             names.append((model.joint(j).name or str(j)) + part)
     return names, gone, travelled
+
+
+def _check_targets(recording, model):
+    """Raises RecordingError where a servo's targets follow the positions in another unit."""
+    for a in range(model.nactuator):
+        joint = joint_of(model, a)
+        if joint is None or not is_servo(model, a):
+            continue
+        target = recording.ctrl[:, model.actuator_ctrladr[a]]
+        q = recording.qpos[:, model.jnt_qposadr[model.joint(joint).id]]
+        known = np.isfinite(q)
+        target, q = target[known] - target[known].mean(), q[known] - q[known].mean()
+        if known.sum() < 20 or not target.any() or not q.any():
+            continue
+        ratio = np.sqrt((target @ target) / (q @ q))
+        if _alike(target, q) > 0.8 and (0.7 < ratio / 57.3 < 1.4 or 0.7 < ratio * 57.3 < 1.4):
+            which = ("target", "position") if ratio > 1 else ("position", "target")
+            raise RecordingError(
+                f"{recording.name}: the {which[0]}s of joint {joint!r} are in degrees beside its "
+                f"{which[1]}s in rad, mixed units; convert one of them (--map with a scale)"
+            )
 
 
 def _alike(a, b):
