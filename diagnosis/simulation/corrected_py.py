@@ -5,7 +5,8 @@ parts = python_parts(world.model, setting)              # [] where corrected.xml
 setting
 write_corrected_py("report/corrected.py", "report/corrected.xml", parts, joints)
 rows = predictions("report/corrected.py", windows, world.model)      # in a process of its own
-env_batch = BatchCorrections(batch, parts); env_batch.step(nstep=5)  # many environments at once
+step = module_of(parts, joints).step                    # step(model, data, nstep) in this process
+batch = CorrectedBatch(model, 64, parts=parts)          # many environments at once, for training
 
 The script is diagnosis/simulation/corrected_template.py with the laws that are needed, and the
 numbers.
@@ -22,10 +23,11 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
 from diagnosis.common.atomic_files import write_whole
 from diagnosis.effects import EFFECTS
-from diagnosis.effects.actuators import actuator_force
+from diagnosis.effects.base import Part
 from diagnosis.simulation import corrected_template
 
 TEMPLATE = Path(corrected_template.__file__)
@@ -200,14 +202,27 @@ def module_of(parts, joints=()):
     return module
 
 
+def parts_in(text):
+    """The Parts of a corrected.py, read from its text without running it. Raises ScriptError."""
+    try:
+        (value,) = (
+            ast.literal_eval(node.value)
+            for node in ast.parse(text).body
+            if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "PARTS"
+        )
+        return [Part(*part) for part in value]
+    except (ValueError, SyntaxError, TypeError):
+        raise ScriptError("not a corrected.py: it has no PARTS to read") from None
+
+
 class BatchLook:
     """What the laws see of all the simulations of a mujoco Batch: as corrected_template.Look,
-    arrays (nsim,)."""
+    (nsim,)."""
 
-    def __init__(self, batch, forces):
-        self.batch, self.model, self._forces = batch, batch.model, forces
+    def __init__(self, batch):
+        self.batch, self.model = batch, batch.model
         self.time, self.step = batch.bind("time").copy(), batch.model.opt.timestep
-        names = ("qpos", "qvel", "ctrl", "qfrc_bias")
+        names = ("qpos", "qvel", "ctrl", "qfrc_bias", "actuator_force")
         self._state = {name: batch.bind(name) for name in names}
 
     def position(self, joint):
@@ -220,57 +235,54 @@ class BatchLook:
         return self._state["qfrc_bias"][:, self.model.joint(joint).dofadr[0]]
 
     def force(self, actuator):
-        state = (self._state[name] for name in ("qpos", "qvel", "ctrl"))
-        return self._forces[actuator](*state)
+        return self._state["actuator_force"][:, self.model.actuator(actuator).id]
 
     def control(self, actuator):
-        u = self.model.actuator_ctrladr[self.model.actuator(actuator).id]
-        limited, value = self.model.actuator_ctrllimited[u], self._state["ctrl"][:, u]
+        a = self.model.actuator(actuator).id
+        u, value = (
+            self.model.actuator_ctrladr[a],
+            self._state["ctrl"][:, self.model.actuator_ctrladr[a]],
+        )
+        if self.model.actuator_delay[a] > 0 or self.model.actuator_actadr[a] >= 0:
+            raise ValueError(f"actuator {actuator}: a batch does not tell its delayed control")
+        limited = self.model.actuator_ctrllimited[u]
         return np.clip(value, *self.model.actuator_ctrlrange[u]) if limited else value
 
 
-class BatchCorrections:
-    """Steps a mujoco Batch of corrected.xml with what corrected.py adds.
+class CorrectedBatch(Batch):
+    """A mujoco Batch of corrected.xml whose steps add what corrected.py does, for training.
 
-    batch: it gets a dof_frictionloss of each simulation's own. Raises ValueError for actuators
-    with a
-    delay or a filter, whose force a batch does not tell before the step.
+    batch = CorrectedBatch(model, nsim=64, parts=parts_in(text))      # and then as any Batch
+
+    Joints whose friction varies get a dof_frictionloss of each simulation's own. step() raises
+    ValueError for a force
+    over the control of an actuator with a delay or a filter.
     """
 
-    def __init__(self, batch, parts):
-        self.batch, self.parts = batch, list(parts)
-        self.module, self.memory = module_of(self.parts), {}
-        model = batch.model
-        joined = [
-            a
-            for a in np.flatnonzero(model.actuator_ctrlnum == 1)
-            if model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT)
-        ]
-        late = [a for a in joined if model.actuator_delay[a] > 0 or model.actuator_actadr[a] >= 0]
-        if late and self.parts:
-            name = model.actuator(late[0]).name
-            raise ValueError(f"actuator {name}: a delay or filter beside what corrected.py adds")
-        self._forces = {model.actuator(a).name: actuator_force([model], a) for a in joined}
-        self._loss = batch.expand("dof_frictionloss") if self.parts else None
-        self._least = model.dof_frictionloss.copy()
+    def __init__(self, model, nsim, nthread=0, parts=()):
+        super().__init__(model, nsim, nthread)
+        self._parts, self._memory = list(parts), {}
+        self._script = module_of(self._parts)
+        dry = any(part.law in self._script.FRICTION for part in self._parts)
+        self._loss = self.expand("dof_frictionloss") if dry else None
 
-    def step(self, ids=None, nstep=1):
+    def step(self, ids=None, nstep=1, stage=0):
         """As Batch.step, with the corrections worked out at the beginning of each step."""
-        batch = self.batch
-        if not self.parts:
-            batch.step(ids, nstep=nstep)
+        if not self._parts:
+            super().step(ids, nstep, stage)
             return
-        ctrl, pushed = batch.bind("ctrl"), batch.bind("qfrc_applied")
-        for _ in range(nstep):
-            wanted, before = ctrl.copy(), pushed.copy()
-            look = BatchLook(batch, self._forces)
-            ctrl[:] = self.module.controls(batch.model, look, wanted, self.memory)
-            batch.forward(ids, int(mujoco.mjtStage.mjSTAGE_VEL))
-            force, level = self.module.corrections(batch.model, look)
+        ctrl, pushed = self.bind("ctrl"), self.bind("qfrc_applied")
+        wanted, before = ctrl.copy(), pushed.copy()
+        for k in range(nstep):
+            look = BatchLook(self)
+            ctrl[:] = self._script.controls(self.model, look, wanted, self._memory)
+            if self._loss is not None:
+                self._loss[:] = self.model.dof_frictionloss
+            self.forward(ids)
+            force, level = self._script.corrections(self.model, look)
             for dof, value in force:
                 pushed[:, dof] += value
-            self._loss[:] = self._least
             for dof, value in level:
                 self._loss[:, dof] += value
-            batch.step(ids)
+            super().step(ids, 1, stage if k == nstep - 1 else 0)
             ctrl[:], pushed[:] = wanted, before

@@ -15,16 +15,17 @@ from diagnosis.effects.base import Part
 from diagnosis.effects.drives import friction_curve
 from diagnosis.effects.unmodelled import surface
 from diagnosis.simulation.corrected_py import (
-    BatchCorrections,
+    CorrectedBatch,
     ScriptError,
     corrected_py,
     module_of,
+    parts_in,
     predictions,
     python_parts,
     write_corrected_py,
     xml_holds,
 )
-from diagnosis.simulation.simulator import Window, World
+from diagnosis.simulation.simulator import Window
 
 AXES = "position:elbow", "velocity:swing"
 ROWS = 45  # of the recording, in the script
@@ -225,31 +226,55 @@ def test_a_ramp_within_a_callback_begins_anew_with_each_run():
         assert data.ctrl[0] == 1.0
 
 
-def test_many_environments_at_once(tmp_path):
+@pytest.mark.parametrize("late", [False, True])
+def test_many_environments_at_once(late):
+    """Each simulation of a batch for training moves as the simulator predicts, with delays too."""
     world, _ = arm("motors")
     recording = record(world)
-    places = {"load_friction": "elbow", "dead_zone": "bend", "torque_speed": "swing"}
-    places["torque_speed"] = next(
-        c.place.name for c in world.candidates if c.effect.name == "torque_speed"
-    )
+    places = {"load_friction": "elbow", "dead_zone": "bend", "torque_speed": "push"}
     setting = {world.candidate(name, place): SIZES[name] for name, place in places.items()}
+    if late:
+        setting[world.candidate("delay", "bend")] = (0.006,)
     xml, written = world.corrected_xml(setting)
-    batch = Batch(mujoco.MjModel.from_xml_string(xml), 3, 1)
-    corrections = BatchCorrections(batch, python_parts(world.model, setting, written))
+    text = corrected_py(python_parts(world.model, setting, written), JOINTS)
+    batch = CorrectedBatch(mujoco.MjModel.from_xml_string(xml), 3, 1, parts=parts_in(text))
     qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-    qpos[:], qvel[:] = START
-    qpos[1] += 0.01
-    for u in recording.ctrl[:-1]:
-        ctrl[:] = u
-        corrections.step(nstep=round(DT / batch.model.opt.timestep))
-        np.testing.assert_array_equal(ctrl, np.tile(u, (3, 1)))
     expected = simulate(world, [setting], recording)[0]
-    np.testing.assert_allclose(qpos[[0, 2]], np.tile(expected[-1], (2, 1)), rtol=0, atol=1e-8)
+    model, data = batch.model, mujoco.MjData(batch.model)
+    count, step = round(DT / model.opt.timestep), module_of(parts_in(text)).step
+    qpos[:], qvel[:] = data.qpos[:], data.qvel[:] = START
+    qpos[1] += 0.01
+    for row, u in enumerate(recording.ctrl[:-1]):
+        ctrl[:] = data.ctrl[:] = u
+        batch.step(nstep=count)
+        step(model, data, count)
+        np.testing.assert_array_equal(ctrl, np.tile(u, (3, 1)))
+        # MuJoCo's history begins with zeros, the simulator's at rest in the first control
+        there = data.qpos if late else expected[row + 1]
+        np.testing.assert_allclose(qpos[[0, 2]], np.tile(there, (2, 1)), rtol=0, atol=1e-8)
     assert abs(qpos[1] - qpos[0]).max() > 1e-4
-    late = World(mujoco.MjSpec.from_string(xml))
-    delayed = late.corrected_xml({late.candidate("delay", "bend"): (0.01,)})[0]
-    with pytest.raises(ValueError, match="bend: a delay or filter"):
-        BatchCorrections(Batch(mujoco.MjModel.from_xml_string(delayed), 1, 1), corrections.parts)
+
+
+def test_a_batch_without_parts_is_mujocos():
+    world, _ = arm("motors")
+    batches = [CorrectedBatch(world.model, 2, 1), Batch(world.model, 2, 1)]
+    for batch in batches:
+        batch.bind("qvel")[:] = START[1]
+        batch.step(nstep=20)
+    np.testing.assert_array_equal(*(batch.state for batch in batches))
+    with pytest.raises(ScriptError, match="no PARTS"):
+        parts_in("import os")
+
+
+def test_a_force_over_a_control_that_comes_late_is_refused_in_a_batch():
+    world, _ = arm("motors")
+    curve = world.curve("elbow", "control:bend", (-1.0, 1.0))
+    setting = {curve: (0.1, 0.2), world.candidate("delay", "bend"): (0.01,)}
+    xml, written = world.corrected_xml(setting)
+    parts = python_parts(world.model, setting, written)
+    batch = CorrectedBatch(mujoco.MjModel.from_xml_string(xml), 1, 1, parts=parts)
+    with pytest.raises(ValueError, match="bend: a batch does not tell its delayed control"):
+        batch.step()
 
 
 def test_a_script_that_does_not_run_is_one_line(tmp_path):
