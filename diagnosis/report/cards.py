@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from diagnosis.recordings import inverse_dynamics
-from diagnosis.report import text
+from diagnosis.report import Diagnosis, text
 from diagnosis.report.charts import Series, binned, chart, whisker
 
 PER_PERIOD, PER_CURVE = 40, 201  # rows of a saved sine per period, and of another saved curve
@@ -26,7 +26,7 @@ WRITTEN = {
 }
 
 
-def cards(diagnosis):
+def cards(diagnosis: Diagnosis) -> list[dict]:
     """A dict for each finding: finding, facts, doubts, estimates, plots, each, constancy."""
     left, curves = inverse_dynamics.residuals(diagnosis), unknown_curves(diagnosis)
     made = []
@@ -103,7 +103,7 @@ def _constancy(finding):
     return f"The recordings {agree} on one value (p {text.p_value(p)}); marked: the value of all."
 
 
-def unknown_curves(diagnosis):
+def unknown_curves(diagnosis: Diagnosis) -> list[dict]:
     """The fitted curves of findings that the catalogue cannot name, one dict each: finding (index),
     variable, factor, period (s, of a sine, or None), x, force (n,), unit. Force between
     neighbouring x is linear; a sine spans all recordings."""

@@ -8,6 +8,7 @@ noise. The markup is templates/chart.svg.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,27 +42,27 @@ class Frame:
     top: int = 10
 
     @property
-    def right(self):
+    def right(self) -> int:
         """Pixel of the right end."""
         return self.width - 10
 
     @property
-    def bottom(self):
+    def bottom(self) -> int:
         """Pixel of the lower end."""
         return self.height - 40
 
     @property
-    def origin(self):
+    def origin(self) -> float:
         """What is taken off the words at x ticks: 0, unless the axis lies far from it."""
         x0, x1 = self.box[:2]
         return float(math.floor(x0)) if abs(x0) > FAR * (x1 - x0) else 0.0
 
-    def px(self, x):
+    def px(self, x) -> np.ndarray:
         """Data to horizontal pixels."""
         x0, x1 = self.box[:2]
         return self.left + (np.asarray(x, float) - x0) / (x1 - x0) * (self.right - self.left)
 
-    def py(self, y):
+    def py(self, y) -> np.ndarray:
         """Data to vertical pixels."""
         y, (y0, y1) = np.asarray(y, float), self.box[2:]
         if self.log_y:
@@ -71,20 +72,20 @@ class Frame:
         return self.bottom - share * (self.bottom - self.top)
 
     @property
-    def x_ticks(self):
+    def x_ticks(self) -> list[tuple[float, str]]:
         """[(pixel, words)]."""
         marks = ticks(*self.box[:2], 5 if self.width < 500 else 9)
         return [(float(self.px(t)), _tick(t - self.origin)) for t in marks]
 
     @property
-    def y_ticks(self):
+    def y_ticks(self) -> list[tuple[float, str, bool]]:
         """[(pixel, words, whether it is zero)]."""
         low, high = self.box[2:]
         marks = log_ticks(low, high) if self.log_y else ticks(low, high, 4)
         return [(float(self.py(t)), _tick(t), abs(t) < 1e-12) for t in marks]
 
 
-def ticks(low, high, count=5):
+def ticks(low: float, high: float, count: int = 5) -> list[float]:
     """Round numbers that span [low, high], about `count` of them."""
     if not high > low:
         return [low]
@@ -95,7 +96,7 @@ def ticks(low, high, count=5):
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def log_ticks(low, high):
+def log_ticks(low: float, high: float) -> list[float]:
     """1, 2, 5 times powers of ten within [low, high]; powers alone where those are many."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     found = [m * 10.0**k for k in powers for m in (1, 2, 5)]
@@ -105,7 +106,7 @@ def log_ticks(low, high):
     return [t for t in inside if abs(math.log10(t) - round(math.log10(t))) < 1e-6]
 
 
-def thin(x, y, most=700):
+def thin(x: np.ndarray, y: np.ndarray, most: int = 700) -> tuple[np.ndarray, np.ndarray]:
     """Fewer points of a curve that look the same: the extremes of every stretch, in order, with
     gaps (NaN) kept."""
     if len(x) <= most:
@@ -123,7 +124,16 @@ def thin(x, y, most=700):
     return x[order], y[order]
 
 
-def chart(series, x_label, y_label, width=380, height=230, log_y=False, zero=False, label=""):
+def chart(
+    series: list[Series],
+    x_label: str,
+    y_label: str,
+    width: int = 380,
+    height: int = 230,
+    log_y: bool = False,
+    zero: bool = False,
+    label: str = "",
+) -> str:
     """An SVG chart as Markup. label: what a screen reader says. zero: include y = 0. "" where
     nothing is finite."""
     series = [s for s in series if len(s.x) and np.isfinite(s.y).any()]
@@ -184,7 +194,7 @@ def _tick(value):
     return f"{value:.6g}".replace("-", "−")
 
 
-def binned(x, y, bins=24):
+def binned(x: np.ndarray, y: np.ndarray, bins: int = 24) -> tuple[np.ndarray, np.ndarray]:
     """Median of y in equally filled bins of x: (centres, medians), the shape that scattered points
     hide. Empty where there are fewer than two points for each bin."""
     good = np.isfinite(x) & np.isfinite(y)
@@ -195,7 +205,7 @@ def binned(x, y, bins=24):
     return tuple(np.array([np.median(values[g]) for g in groups]) for values in (x, y))
 
 
-def whisker(parameter, span=(), width=220, height=34):
+def whisker(parameter: dict, span: Sequence[float] = (), width: int = 220, height: int = 34) -> str:
     """A parameter's estimate and 95 % interval beside its nominal value, as a small SVG. span:
     further values for which the axis has room, where several are compared."""
     value, low, high, nominal = (parameter.get(key) for key in ("value", "low", "high", "nominal"))

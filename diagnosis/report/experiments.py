@@ -110,7 +110,7 @@ def _way(one, other):
     )
 
 
-def advice(findings):
+def advice(findings: list[dict]) -> list[str]:
     """[sentence] for the findings (as in diagnosis.json) that list rivals in `also_possible`."""
     lines = []
     for finding in findings:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.report import text
+from diagnosis.report import Diagnosis, text
 from diagnosis.report.charts import Series, chart
 
 BINS = 24  # of a variable, over which the force is averaged
@@ -49,28 +49,28 @@ class Joint:
     depends_on: tuple = ()
 
     @property
-    def force(self):
+    def force(self) -> np.ndarray:
         """(n,) of all courses in a row."""
         return np.concatenate([c.force for c in self.courses])
 
     @property
-    def rms(self):
+    def rms(self) -> float:
         """Root mean square of the force."""
         return float(np.sqrt(np.nanmean(self.force**2)))
 
     @property
-    def certain(self):
+    def certain(self) -> float:
         """Share of the moments in which the force is more than its own uncertainty."""
         sd = np.concatenate([c.sd for c in self.courses])
         known = np.isfinite(self.force) & np.isfinite(sd)
         return float(np.mean(np.abs(self.force[known]) > SURE * sd[known])) if known.any() else 0.0
 
     @property
-    def missing(self):
+    def missing(self) -> bool:
         """Whether there is more than chance would show; 5 % of noise lies outside its 95 %."""
         return self.certain > MISSING
 
-    def best(self):
+    def best(self) -> tuple[str, float]:
         """(variable, share of the variance that goes with it), of the one that the diagnosis names,
         or else that explains most."""
         named = [name for name in self.depends_on if name in self.variables]
@@ -80,7 +80,7 @@ class Joint:
         most = max(shares.values())
         return next((name, share) for name, share in shares.items() if share >= most - ALIKE)
 
-    def words(self):
+    def words(self) -> str:
         """What the pictures say, in a sentence."""
         unit, (variable, share) = self.courses[0].unit, self.best()
         parts = [f"RMS {text.number(self.rms, 2)} {unit}"]
@@ -90,7 +90,7 @@ class Joint:
             parts.append(f"{100 * share:.0f} % of its variance goes with {on}")
         return "; ".join(parts) + "."
 
-    def pictures(self):
+    def pictures(self) -> tuple[str, str, str]:
         """(the recording drawn over time, chart over time, chart over the best variable)."""
         loudest = max(self.courses, key=lambda c: np.nanmean(c.force**2))
         label = f"force missing ({loudest.unit})"
@@ -115,7 +115,7 @@ class Joint:
         return loudest.recording, drawn, over_best
 
 
-def courses(diagnosis):
+def courses(diagnosis: Diagnosis) -> list[Course]:
     """The courses of a diagnosis, from `located` or from the list in its summary; none where it has
     neither."""
     records = getattr(diagnosis, "located", None) or diagnosis.summary.get("missing_force")
@@ -127,7 +127,7 @@ def courses(diagnosis):
     ]
 
 
-def joints(diagnosis):
+def joints(diagnosis: Diagnosis) -> list[Joint]:
     """Joint for each that has a course, first where the missing force is most certain."""
     grouped, units, told = {}, {}, diagnosis.summary.get("missing_force")
     for course in courses(diagnosis):
@@ -165,7 +165,7 @@ def _groups(x, force):
     return np.array_split(known[np.argsort(x[known], kind="stable")], count)
 
 
-def explained(x, force):
+def explained(x: np.ndarray, force: np.ndarray) -> float:
     """Share of the force's variance between bins of x, corrected for their number; not below 0."""
     groups = [g for g in _groups(x, force) if len(g)]
     n, k = sum(map(len, groups)), len(groups)
@@ -176,7 +176,7 @@ def explained(x, force):
     return max(0.0, 1.0 - within / max(values.var(ddof=1), 1e-300))
 
 
-def averaged(x, force):
+def averaged(x: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
     """(centres, means, standard errors of the means) in equally filled bins of x."""
     rows = [
         (np.mean(x[g]), np.mean(force[g]), np.std(force[g], ddof=1) / np.sqrt(len(g)))

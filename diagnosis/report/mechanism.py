@@ -6,6 +6,7 @@
 What is drawn is a list of shapes; templates/drawing.svg turns them into markup.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -46,7 +47,14 @@ class Words:
     words: str
 
 
-def mechanism(model, poses, places, labels, width=380, height=300):
+def mechanism(
+    model: mujoco.MjModel,
+    poses: list[np.ndarray],
+    places: list[dict],
+    labels: list[str],
+    width: int = 380,
+    height: int = 300,
+) -> str:
     """SVG of the model in poses[0] (other poses faintly behind), the places of the findings
     coloured and labelled.
 
@@ -114,7 +122,7 @@ def _labelled(labels, points, paper):
     return shapes
 
 
-def marked(model, place):
+def marked(model: mujoco.MjModel, place: dict) -> tuple[list[int], Callable | None]:
     """(geom ids, function of MjData or None) of a finding's place: what to colour, and the point
     (3,) to mark."""
     kind, name = place["kind"], place["name"]
@@ -229,7 +237,13 @@ def _joint(model, data, j, axes, paper):
     return [Path("slide", "".join(path(middle + np.array(line)) for line in lines))]
 
 
-def animation(model, motions, seconds, width=380, height=300):
+def animation(
+    model: mujoco.MjModel,
+    motions: dict[str, np.ndarray],
+    seconds: float,
+    width: int = 380,
+    height: int = 300,
+) -> str:
     """An animation as Markup: {"measured": (F, nq), "nominal": ..., "corrected": ...} drawn over
     each other, F frames that last `seconds`. "" where nothing of the model can be seen.
 

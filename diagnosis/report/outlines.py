@@ -18,7 +18,7 @@ CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)
 AZIMUTH, ELEVATION = np.deg2rad(-60), np.deg2rad(20)  # from where spatial mechanisms are seen
 
 
-def posed(model, qpos):
+def posed(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
     """MjData with the kinematics of a pose (nq,)."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -26,7 +26,7 @@ def posed(model, qpos):
     return data
 
 
-def view(model, qpos):
+def view(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(2, 3) world directions of right and up on paper, and (3,) the one towards the viewer."""
     data = posed(model, qpos)
     hinges = data.xaxis[model.jnt_type == int(JOINT.mjJNT_HINGE)]
@@ -51,7 +51,9 @@ def view(model, qpos):
     return np.stack([right, np.cross(towards, right)]), towards
 
 
-def outlines(model, qpos, axes, towards):
+def outlines(
+    model: mujoco.MjModel, qpos: np.ndarray, axes: np.ndarray, towards: np.ndarray
+) -> list[tuple[int, np.ndarray, float]]:
     """[(geom id, (n, 2) outline, depth)] of every visible geom that is not a plane; far ones
     first."""
     data, found = posed(model, qpos), []
@@ -89,7 +91,7 @@ def _outline(model, data, g, axes):
     return hull(points @ axes.T)
 
 
-def hull(points):
+def hull(points: np.ndarray) -> np.ndarray:
     """(n, 2) points to the corners of their convex hull, anticlockwise; of a line its two ends."""
     points = np.unique(np.round(points, 9), axis=0)
     if len(points) < 3:

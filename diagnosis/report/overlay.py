@@ -4,11 +4,13 @@ no catalogue."""
 import mujoco
 import numpy as np
 
+from diagnosis.report import Diagnosis
+
 FRAMES, SECONDS = 60, 2.0
 BEFORE = 1.0  # s, over which actuator states and delayed controls run on to the start
 
 
-def poses(model, recordings, count=4):
+def poses(model: mujoco.MjModel, recordings: list, count: int = 4) -> list[np.ndarray]:
     """[(nq,)] recorded poses, evenly spread over the longest recording; unmeasured joints stay at
     their reference."""
     longest = max((r.seen() for r in recordings), key=lambda recording: len(recording.time))
@@ -16,12 +18,12 @@ def poses(model, recordings, count=4):
     return [whole(model, longest.qpos[int(row)]) for row in rows]
 
 
-def whole(model, qpos):
+def whole(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """(..., nq) with what was not measured at its reference."""
     return np.where(np.isnan(qpos), model.qpos0, qpos)
 
 
-def simulate(model, recording, first, last, columns):
+def simulate(model: mujoco.MjModel, recording, first: int, last: int, columns: tuple) -> np.ndarray:
     """(last - first + 1, nq) from the recorded state of row `first` under the recorded control.
     columns: (qpos, dof) indices of the recorded coordinates within `model`. NaN from where the
     simulation blows up.
@@ -70,7 +72,7 @@ def simulate(model, recording, first, last, columns):
     return out
 
 
-def velocity(model, recording, row, columns):
+def velocity(model: mujoco.MjModel, recording, row: int, columns: tuple) -> np.ndarray:
     """(nv,) measured at `row`, else by the slope over the rows around it; 0 where neither is
     known."""
     before, after = max(0, row - 2), min(len(recording.time) - 1, row + 2)
@@ -84,7 +86,7 @@ def velocity(model, recording, row, columns):
     return np.where(np.isnan(recording.qvel[row]), slope[columns[1]], recording.qvel[row])
 
 
-def columns_in(model, nominal):
+def columns_in(model: mujoco.MjModel, nominal: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """(qpos, dof) indices in `model` of the nominal model's coordinates: joints by name, unnamed
     ones in their order."""
     qpos, dof = [], []
@@ -98,7 +100,7 @@ def columns_in(model, nominal):
     return np.array(qpos, dtype=int), np.array(dof, dtype=int)
 
 
-def overlay(diagnosis):
+def overlay(diagnosis: Diagnosis) -> tuple[str, float, float, dict] | None:
     """(recording's name, start in s, seconds, {"measured" | "nominal" | "corrected": (F, nq)}) of
     the held-out stretch of at most SECONDS that the nominal model predicts worst, or None where
     there is nothing to compare."""

@@ -6,6 +6,7 @@ Everything is escaped unless it is Markup, which is what `render` returns. Style
 inlined: the page fetches nothing.
 """
 
+from collections.abc import Iterable
 from functools import cache
 from importlib.resources import files
 
@@ -42,12 +43,12 @@ def _inlined(name):
     return Markup((files("diagnosis.report") / name).read_text(encoding="utf-8"))
 
 
-def render(template, **values):
+def render(template: str, **values) -> Markup:
     """A template of `templates/` filled in, as Markup."""
     return Markup(_environment().get_template(template).render(**values))
 
 
-def path(points, closed=False, digits=1):
+def path(points: Iterable, closed: bool = False, digits: int = 1) -> str:
     """(n, 2) pixels as the `d` of an SVG path. Rows that are not finite break the line."""
     parts, pen = [], "M"
     for x, y in points:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.report import experiments, force, mechanism, overlay, text
+from diagnosis.report import Diagnosis, experiments, force, mechanism, overlay, text
 from diagnosis.report.cards import cards, unknown_curves
 from diagnosis.report.charts import Series, chart
 from diagnosis.report.page import render
@@ -31,7 +31,7 @@ class Section:
     note: str = ""
 
 
-def html_page(diagnosis):
+def html_page(diagnosis: Diagnosis) -> str:
     """The whole page as a string."""
     title = f"Diagnosis: {text.model_title(diagnosis.world.model)}"
     made = (
@@ -264,7 +264,7 @@ def _about(diagnosis):
     return Section("The recordings", body)
 
 
-def reads_files(xml):
+def reads_files(xml: str) -> bool:
     """Whether MJCF names files of meshes, textures or height fields."""
     return bool(re.search(r'\sfile\w*="', xml))
 

@@ -4,6 +4,7 @@ Everything here reads `Diagnosis.summary`, the dictionary that becomes diagnosis
 """
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -31,19 +32,19 @@ SMALL = {
 }  # errors and noise are small: in these they read better
 
 
-def effect_words(effect):
+def effect_words(effect: str) -> str:
     """ "coulomb_friction" -> "Coulomb friction"."""
     for name, spoken in SPOKEN.items():
         effect = effect.replace(name, spoken)
     return effect.replace("_", " ")
 
 
-def place_words(place):
+def place_words(place: dict) -> str:
     """{"kind": "joint", "name": "elbow"} -> "joint elbow"."""
     return "the world" if place["kind"] == "world" else f"{place['kind']} {place['name']}"
 
 
-def number(value, digits=3):
+def number(value: float | None, digits: int = 3) -> str:
     """A number to so many significant digits, without a needless exponent: 0.0005, 411, 1.2e-07."""
     if value is None or math.isnan(value):
         return "–"
@@ -57,7 +58,7 @@ def number(value, digits=3):
     return f"{value:.{decimals}f}"
 
 
-def estimate(parameter):
+def estimate(parameter: dict) -> str:
     """A parameter with its 95 % interval, to the digits the interval warrants: "0.121 ± 0.004
     N·m"."""
     value, low, high, unit = (parameter.get(key) for key in ("value", "low", "high", "unit"))
@@ -81,7 +82,7 @@ def estimate(parameter):
     return f"{value:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f}){unit}"
 
 
-def finding_words(finding):
+def finding_words(finding: dict) -> str:
     """One finding in a sentence: "joint elbow: Coulomb friction 0.121 ± 0.004 N·m was left out"."""
     place, effect = place_words(finding["place"]), effect_words(finding["effect"])
     if finding["effect"] == "unknown":
@@ -128,7 +129,7 @@ def finding_words(finding):
     return sentence + when_words(finding.get("when"))
 
 
-def there(effect, parameter):
+def there(effect: str, parameter: dict) -> bool:
     """Whether the nominal model has some of an effect, so that a parameter of it is wrong rather
     than left out."""
     if effect == "joint_stop":
@@ -136,7 +137,7 @@ def there(effect, parameter):
     return effect in ALWAYS_THERE or parameter["nominal"] not in (0, None, math.inf, -math.inf)
 
 
-def no_stop(name, value):
+def no_stop(name: str, value: float | None) -> str | None:
     """ "no stop below" or "no stop above" of a joint stop's bound that is out of reach, else
     None."""
     if name in ("low", "high") and (value is None or not abs(value) < JointStop.NEVER):
@@ -144,7 +145,7 @@ def no_stop(name, value):
     return None
 
 
-def change(parameter):
+def change(parameter: dict) -> str:
     """ "4.52 ± 0.03 kg instead of 3.56 (+27 %)"."""
     nominal, stop = parameter["nominal"], no_stop(parameter["name"], parameter["value"])
     if nominal is None or math.isinf(nominal) or parameter["value"] is None:
@@ -162,7 +163,7 @@ def change(parameter):
     return f"{estimate(parameter)} instead of {number(nominal)}{share}"
 
 
-def when_words(when):
+def when_words(when: dict | None) -> str:
     """The `when` of a finding as the end of a sentence."""
     if not when:
         return ""
@@ -178,13 +179,13 @@ def when_words(when):
     )
 
 
-def state_words(name):
+def state_words(name: str) -> str:
     """ "qpos:elbow" -> "the position of elbow"."""
     kind, _, joint = name.partition(":")
     return {"qpos": "the position of ", "qvel": "the velocity of "}[kind] + joint
 
 
-def depends_words(depends_on):
+def depends_words(depends_on: Iterable[str] | None) -> str:
     """["velocity:elbow", "time"] -> "the velocity of elbow and time"."""
     words = []
     for item in depends_on or []:
@@ -199,7 +200,7 @@ def depends_words(depends_on):
     return " and ".join(words)
 
 
-def errors(summary):
+def errors(summary: dict) -> tuple[float, float, float, str, str]:
     """Held-out error (before, after, floor, unit, place), three numbers and two texts: in SI at the
     channel that the correction betters most (or worsens most, where it worsens the whole), or,
     where they are the same, which is farthest from a perfect one; or over all channels in multiples
@@ -230,7 +231,7 @@ def _infinite(fit):
     }
 
 
-def channel_words(name):
+def channel_words(name: str) -> str:
     """ "qpos:elbow" -> "elbow", "qpos:root:rot" -> "root (rotation)"; a joint without a name goes
     by its index."""
     joint, _, part = name.split(":", 1)[1].partition(":")
@@ -238,7 +239,7 @@ def channel_words(name):
     return ("joint " if joint.isdigit() else "") + joint + part
 
 
-def error_words(summary):
+def error_words(summary: dict) -> str:
     """ "held-out error 0.3 s ahead falls from 31 to 2 mrad at elbow; a perfect simulator's would be
     1, from noise in ..."."""
     *values, unit, place = errors(summary)
@@ -266,7 +267,7 @@ def error_words(summary):
     return f"{ahead} {change}{place}; {perfect}"
 
 
-def blown_words(blown):
+def blown_words(blown: dict) -> str:
     """{"before": 3, "after": 0, "of": 40} -> what the curve of error against horizon leaves out."""
     parts = [
         f"{blown[key]} of {blown['of']} windows blow up under the {name} model"
@@ -276,7 +277,7 @@ def blown_words(blown):
     return sentence(" and ".join(parts) + ": from then on they are left out of its line")
 
 
-def unexplained_words(summary):
+def unexplained_words(summary: dict) -> str:
     """What is left over, in a sentence, or "" where nothing worth saying is."""
     left = summary.get("unexplained") or {}
     if not (left.get("fraction") or 0) >= 0.02:
@@ -289,7 +290,7 @@ def unexplained_words(summary):
     return f"{share} of the original squared error stays unexplained{at}{on}"
 
 
-def verdict_words(summary):
+def verdict_words(summary: dict) -> str:
     """The first line of everything."""
     if summary["verdict"] == "unresolved":
         effects = {finding["effect"] for finding in summary["findings"]}
@@ -309,7 +310,7 @@ def verdict_words(summary):
     )
 
 
-def terminal(summary, out, files):
+def terminal(summary: dict, out: str, files: list[str]) -> str:
     """The summary for the terminal, several lines; the last names the files written into folder
     out."""
     lines = [verdict_words(summary)]
@@ -331,7 +332,7 @@ def terminal(summary, out, files):
     return "\n".join(lines)
 
 
-def doubts(finding):
+def doubts(finding: dict) -> list[str]:
     """What speaks against the name of a finding, a few words each."""
     found = []
     if finding.get("adequate") is False:
@@ -345,19 +346,19 @@ def doubts(finding):
     return found
 
 
-def sentence(words):
+def sentence(words: str) -> str:
     """With a capital and a full stop."""
     return words[:1].upper() + words[1:] + "."
 
 
-def p_value(p):
+def p_value(p: float | None) -> str:
     """ "< 1e-16", "0.03"."""
     if p is None or not math.isfinite(p):
         return "–"
     return "< 1e-16" if p < 1e-16 else number(p, 2)
 
 
-def axis_words(variable, unit=None):
+def axis_words(variable: str, unit: str | None = None) -> str:
     """ "velocity:elbow" -> "velocity of elbow (rad/s)"."""
     kind, _, name = variable.partition(":")
     return (f"{kind} of {name}" if name else kind) + (
@@ -365,6 +366,6 @@ def axis_words(variable, unit=None):
     )
 
 
-def model_title(model):
+def model_title(model) -> str:
     """The model's own name: the first of MuJoCo's NUL-separated names."""
     return bytes(model.names).split(b"\0", 1)[0].decode(errors="replace") or "the mechanism"

@@ -9,10 +9,12 @@ import json
 import math
 import os
 import re
+from typing import Any
 
 import numpy as np
 
 from diagnosis.common.atomic_files import WriteError, write_together
+from diagnosis.report import Diagnosis
 from diagnosis.report.cards import unknown_curves
 from diagnosis.report.force import courses
 from diagnosis.report.sections import html_page, reads_files
@@ -22,7 +24,7 @@ class ReportError(ValueError):
     """The report cannot be written. One line: where, why, and what to do."""
 
 
-def check_folder(out):
+def check_folder(out: str | os.PathLike) -> None:
     """Raises ReportError where a folder `out` cannot be written, before any computing is done."""
     if not out:
         raise ReportError("--out: no folder given; give the name of one to write")
@@ -38,7 +40,7 @@ def check_folder(out):
         )
 
 
-def write(diagnosis, out):
+def write(diagnosis: Diagnosis, out: str | os.PathLike) -> list[str]:
     """Write the report into folder `out`; the names of its files.
 
     report.html, diagnosis.json, corrected.xml, where needed corrected.py, a curve for each unknown
@@ -119,7 +121,7 @@ def _course_table(courses):
     return text.getvalue()
 
 
-def portable(xml, out):
+def portable(xml: str, out: str | os.PathLike) -> str:
     """MJCF for folder `out`: where it reads files, folders of meshes and textures as seen from
     there, else without them."""
     reads = reads_files(xml)
@@ -180,7 +182,7 @@ def _multiplier(factor):
     return f"sign({factor})" if factor.startswith("velocity") else factor
 
 
-def plain(value):
+def plain(value: Any) -> Any:
     """Strict JSON: numpy to Python, and null for what is not a finite number."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
