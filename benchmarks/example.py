@@ -63,7 +63,7 @@ def draw(rows):
     """Three panels: elbow angle over time, error against horizon, force left over against velocity."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
-    from figures import binned
+    from diagnosis.report.charts import binned
 
     def columns(panel):
         return np.array([[float(cell) for cell in row[1:]] for row in rows if row[0] == panel]).T
