@@ -63,6 +63,7 @@ def draw(rows):
     """Three panels: elbow angle over time, error against horizon, force left over against velocity."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+
     from diagnosis.report.charts import binned
 
     def columns(panel):
