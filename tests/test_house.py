@@ -23,7 +23,7 @@ FLOORS = (
     ("diagnosis.report", "diagnosis.design"),
     ("diagnosis.command", "prove"),
     ("diagnosis.__init__", "diagnosis.__main__", "diagnose", "training"),
-    ("train",),
+    ("train", "reproduce"),
     ("benchmarks",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
