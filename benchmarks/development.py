@@ -2,9 +2,9 @@
 
     python benchmarks/development.py draw --cache devset --trials 40
     python benchmarks/development.py score --cache devset --out results/development.csv
-    python benchmarks/development.py score --cache devset --only 3,8-12 --against old.csv --out new.csv
+    python benchmarks/development.py score --cache devset --only 3,8-12 --against old.csv
     python benchmarks/development.py score --cache devset --kinds null,single --free --out new.csv
-    python benchmarks/development.py score --cache devset --version ../other/checkout --out other.csv
+    python benchmarks/development.py score --cache devset --version ../other --out other.csv
     python benchmarks/development.py score --cache devset --tool "mytool {model} {recordings} {out}"
 
 Trials follow the DEVELOPMENT settings, in half of which something touches the ground or a stop.
@@ -49,7 +49,7 @@ DIAGNOSE = (
 
 @dataclass(frozen=True)
 class Job:
-    """A drawn trial and the tool to run on it. limit: processor seconds; keep: folder for reports."""
+    """A drawn trial and the tool to run. limit: processor seconds; keep: folder for reports."""
 
     number: int
     folder: Path
@@ -186,7 +186,7 @@ def totals(rows):
     return "\n".join(
         [
             *out,
-            f"predicts worse than nominal {worse}; within 1.1 of the true model {count(rows, near)};"
+            f"predicts worse than nominal {worse}, within 1.1 of the truth {count(rows, near)};"
             f" processor seconds: mean {np.mean(seconds):.1f}, median {np.median(seconds):.1f}",
         ]
     )

@@ -1,4 +1,4 @@
-"""What the entrants share: reading a trial's folder, smooth states, writing what the benchmark scores.
+"""What the entrants share: reading a trial's folder, smooth states, writing what is scored.
 
 Nothing here is the diagnosis' own: an entrant is what a user would write with other tools.
 """

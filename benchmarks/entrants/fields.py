@@ -11,7 +11,7 @@ USUAL = ("mass", "armature", "viscous_damping", "coulomb_friction", "gain")
 
 @dataclass(frozen=True)
 class Field:
-    """A number of the model. set(spec, value) writes it; low, high bound it; size: a usual change."""
+    """A number of the model. set(spec, value) writes it; low and high bound it."""
 
     effect: str
     kind: str

@@ -19,7 +19,7 @@ from common import arguments, states, write  # noqa: E402
 
 WIDTH, EPOCHS, RATE, DECAY = 48, 300, 3e-3, 1e-4
 
-STEP = '''"""Nominal model plus a learned acceleration. Written by benchmarks/entrants/network.py."""
+STEP = '''"""Nominal model plus a learned acceleration, by benchmarks/entrants/network.py."""
 
 from pathlib import Path
 
@@ -37,6 +37,7 @@ def step(model, data):
     for k in range(2):
         x = np.tanh(NET[f"w{k}"] @ x + NET[f"b{k}"])
     more = (NET["w2"] @ x + NET["b2"]) * NET["size"]
+    mujoco.mj_fwdPosition(model, data)
     mujoco.mj_mulM(model, data, data.qfrc_applied, more)
     mujoco.mj_step(model, data)
 '''

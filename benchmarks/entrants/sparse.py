@@ -25,7 +25,7 @@ STILL = 0.02  # rad/s or m/s, over which the sign of the speed is smoothed
 
 
 def residual_force(model, recording):
-    """(q, v, a, drives, lacking) per dof, (T, nv) each: smooth motion, motors' force, what is missing."""
+    """Smooth motion, motors' force, lacking force: (q, v, a, drives, lacking), (T, nv) each."""
     qpos, qvel, qacc = states(recording, model)
     data, lacking, drives = mujoco.MjData(model), [], []
     for q, v, a, u in zip(qpos, qvel, qacc, recording.ctrl):
