@@ -36,11 +36,12 @@ def audit(table, seals, redraw=None, jobs=1):
     numbers = [int(row["number"]) for row in rows]
     if len(set(numbers)) != len(numbers):
         raise SealError(f"{table}: a trial stands there twice")
-    missing = sorted(set(published) - set(numbers))
-    if missing:
-        raise SealError(
-            f"{table}: {len(missing)} sealed trials are missing, the first {missing[0]}"
-        )
+    wanted = sorted(published)[: len(numbers)]
+    if sorted(numbers) != wanted:
+        lacking = sorted(set(wanted) - set(numbers))
+        raise SealError(f"{table}: trial {lacking[0]} is missing, though later ones were run")
+    if len(numbers) < len(published):
+        yield f"the first {len(numbers)} of {len(published)} sealed trials were run, none left out"
     for row in rows:
         check_row(row, published, commit)
     yield f"{len(rows)} rows: every key is the one that was sealed, every score follows the rules"

@@ -14,6 +14,7 @@ docs/validation.md has the protocol and the rules.
 """
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
@@ -67,6 +68,7 @@ def parse(words):
     command.add_argument("--tool", default=DIAGNOSE, help="command line of the tool to score")
     command.add_argument("--limit", type=int, default=900, help="processor seconds for a trial")
     command.add_argument("--jobs", type=int, default=cores(), help="trials at once")
+    command.add_argument("--minutes", type=float, default=math.inf, help="begin none after these")
     command.add_argument("--ray", metavar="ADDRESS", help="run on this Ray cluster instead")
     command = commands.add_parser("show", help="draw one development trial into a folder")
     command.add_argument("--seed", type=int, required=True)
@@ -104,7 +106,15 @@ def do_run(options):
         tasks = [Task(n, (options.seed, n), "development") for n in range(count)]
     else:
         tasks = sealed_tasks(options.seals)[: options.trials]
-    run_tasks(tasks, options.tool, options.out, options.jobs, options.limit, options.ray)
+    run_tasks(
+        tasks,
+        options.tool,
+        options.out,
+        options.jobs,
+        options.limit,
+        options.ray,
+        options.minutes,
+    )
 
 
 def sealed_tasks(path):

@@ -27,7 +27,7 @@ from diagnosis.trials.truth import TrueSystem
 
 KINDS = ("null", "single", "unknown", "pair", "many")
 SHARES = (0.25, 0.33, 0.2, 0.14, 0.08)
-ATTEMPTS = 30
+ATTEMPTS = 100
 MOST_NOISE = 4e-3  # rad
 TOUCHED = 0.02  # share of the time that a contact or a stop has to act, where one can
 AGREEMENT = 0.5  # noise: most that the nominal integrator may be away from the true one

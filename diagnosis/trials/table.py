@@ -7,11 +7,14 @@ report is scored by `scoring` and replayed on held-out recordings that it never 
 """
 
 import csv
+import itertools
 import json
+import math
 import os
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import time
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -27,6 +30,7 @@ from diagnosis.trials.robots import DEVELOPMENT, FINAL, to_mjcf
 from diagnosis.trials.scoring import Score, score_findings
 from diagnosis.trials.tools import run_tool
 
+QUEUE = 2  # tasks given to a cluster at once, for each of its cores
 SETTINGS = {"development": DEVELOPMENT, "final": FINAL}
 COLUMNS = tuple(
     "number key seals version tool settings answer exit seconds cpu_seconds verdict findings "
@@ -143,14 +147,18 @@ def cores():
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
-def run_tasks(tasks, template, out, jobs, limit, ray_address=None):
-    """Run the tasks that `out` has no row of yet; the table is written after each."""
+def run_tasks(tasks, template, out, jobs, limit, ray_address=None, minutes=math.inf):
+    """Run the tasks that `out` has no row of yet, in order; the table is written after each.
+
+    minutes: after that many no further trial is begun; those under way are finished.
+    """
     rows = read_rows(out)
     done = {int(row["number"]) for row in rows}
     wanted = [task for task in tasks if task.number not in done]
     Path(out).parent.mkdir(parents=True, exist_ok=True)
+    waiting = until(wanted, time.monotonic() + 60 * minutes)
     results = on_ray if ray_address else on_cores
-    source = results(wanted, template, limit, ray_address or jobs)
+    source = results(waiting, template, limit, ray_address or jobs)
     for row in tqdm(source, total=len(wanted), disable=not sys.stderr.isatty()):
         if int(row["number"]) not in done:  # a task that a lost node had done is not counted twice
             done.add(int(row["number"]))
@@ -159,16 +167,23 @@ def run_tasks(tasks, template, out, jobs, limit, ray_address=None):
     return rows
 
 
+def until(tasks, deadline):
+    """The tasks, as long as the clock has not passed the deadline."""
+    for task in tasks:
+        if time.monotonic() > deadline:
+            return
+        yield task
+
+
 def on_cores(tasks, template, limit, jobs):
-    """Rows as they come, from `jobs` processes."""
+    """Rows as they come, from `jobs` processes; a task is taken when a process is free for it."""
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = [pool.submit(run_trial, task, template, limit) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        begin = lambda task: pool.submit(run_trial, task, template, limit)
+        running = {begin(task) for task in itertools.islice(tasks, jobs)}
+        while running:
+            ready, running = wait(running, return_when=FIRST_COMPLETED)
+            running |= {begin(task) for task in itertools.islice(tasks, len(ready))}
+            yield from (future.result() for future in ready)
 
 
 def on_ray(tasks, template, limit, address):
@@ -180,9 +195,12 @@ def on_ray(tasks, template, limit, address):
     ray.init(address=address, runtime_env=environment, log_to_driver=False)
     try:
         remote = ray.remote(num_cpus=1, max_retries=-1)(run_trial)
-        waiting = [remote.remote(task, template, limit) for task in tasks]
-        while waiting:
-            ready, waiting = ray.wait(waiting, num_returns=1)
+        begin = lambda task: remote.remote(task, template, limit)
+        width = QUEUE * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        running = [begin(task) for task in itertools.islice(tasks, width)]
+        while running:
+            ready, running = ray.wait(running, num_returns=1)
+            running += [begin(task) for task in itertools.islice(tasks, len(ready))]
             yield from ray.get(ready)
     finally:
         ray.shutdown()

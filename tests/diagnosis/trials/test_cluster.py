@@ -1,12 +1,54 @@
 """Trials on a Ray cluster of two nodes, one of which is killed half-way. Skipped without ray."""
 
-import shutil
+import threading
 import time
-from pathlib import Path
+from collections import Counter
 
 import pytest
 
-ray = pytest.importorskip("ray")
-cluster_utils = pytest.importorskip("ray.cluster_utils")
+from diagnosis.trials import table
+from diagnosis.trials.table import Task, read_rows, run_tasks
 
-from diagnosis.trials import table  # noqa: E402
+COUNT = 24
+
+
+@pytest.fixture
+def cluster():
+    """A cluster of two nodes, two cores each, with a head that runs nothing."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    yield made
+    made.shutdown()
+
+
+def test_a_node_killed_half_way_loses_nothing_and_doubles_nothing(cluster, tmp_path, monkeypatch):
+    nodes = [cluster.add_node(num_cpus=2) for _ in range(2)]
+    log = tmp_path / "log"
+    log.touch()
+
+    def trial(task, template, limit):
+        with open(log, "a") as file:
+            file.write(f"{task.number}\n")
+        time.sleep(0.3)
+        return {"number": task.number, "note": template}
+
+    def kill():
+        while len(log.read_text().split()) < COUNT // 3:
+            time.sleep(0.05)
+        cluster.remove_node(nodes[1], allow_graceful=False)
+
+    monkeypatch.setattr(table, "run_trial", trial)
+    tasks = [Task(number, (1, number), "development") for number in range(COUNT)]
+    killer = threading.Thread(target=kill)
+    killer.start()
+    out = tmp_path / "table.csv"
+    rows = run_tasks(tasks, "tool", out, 1, 10, ray_address=cluster.address)
+    killer.join()
+    begun = Counter(map(int, log.read_text().split()))
+    assert set(begun) == set(range(COUNT))
+    assert max(begun.values()) > 1  # something was under way on the lost node, and begun again
+    assert [int(row["number"]) for row in read_rows(out)] == list(range(COUNT)) and len(
+        rows
+    ) == COUNT
