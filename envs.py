@@ -410,3 +410,17 @@ class BatchEnv(VectorEnv):
                 "environment: if --real changed the model, choose a smaller change"
             )
         return lost
+
+
+# --- by name: gymnasium.make_vec("rgat/Hopper-v5", num_envs=32, real="torso:mass*1.27") -----------
+
+
+def _registered(num_envs, env_id, real="", nthread=0):
+    """The BatchEnv of a registered name; real: a perturbation as parse_perturbation reads it."""
+    return BatchEnv(env_id, num_envs, parse_perturbation(real), nthread=nthread)
+
+
+for _env_id in ENV_IDS:  # on import, as gymnasium asks for it
+    gymnasium.register(
+        f"rgat/{_env_id}", vector_entry_point=_registered, kwargs={"env_id": _env_id}
+    )
