@@ -106,6 +106,7 @@ class Effect:
     kinds = ()  # kinds of place; one instance for each, with the attribute `kind`
     constants = False  # edit() changes something that mj_setConst derives constants from
     acts_through = ""  # what its force varies with: velocity, position, control or contact
+    loaded = True  # limit() reads qfrc_bias
     timed = False  # differs from a simpler effect only under a condition
     amplitudes = (
         0  # of an effect with probes: how many of its first parameters it acts in proportion to

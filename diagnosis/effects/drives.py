@@ -162,7 +162,7 @@ class FrictionMap(DryFriction):
     Without contrast it is `coulomb_friction`. Of any other shape: see FrictionCurve.
     """
 
-    name, law, amplitudes = "friction_map", "friction_wave", 1
+    name, law, amplitudes, loaded = "friction_map", "friction_wave", 1, False
 
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
@@ -213,7 +213,7 @@ class FrictionCurve(DryFriction):
     FrictionMap, which has one shape.
     """
 
-    name, kind = "friction_map", "joint"
+    name, kind, loaded = "friction_map", "joint", False
 
     def __init__(self, knots):
         self.knots = tuple(float(x) for x in knots)

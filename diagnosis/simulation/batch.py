@@ -233,8 +233,9 @@ class Engine:
             for drives, pool in zip((on, off)[: 1 + conditional], self.clones)
         ]
         rubbing = any(f.varying for f in friction)
-        if rubbing:
-            live["qfrc_bias"] = batch.bind("qfrc_bias")
+        rubs = [c.effect for case in cases for c, _ in case.on if c.effect.overrides("limit")]
+        loaded = any(effect.loaded for effect in rubs)
+        bias = batch.bind("qfrc_bias") if loaded else np.zeros((n, self.model.nv))
         always, never = (-np.inf, np.inf), (np.inf, np.inf)
         low, high = np.array(
             [
@@ -264,10 +265,11 @@ class Engine:
                     )
                     push[members] += np.where(chosen[members, None], added, 0.0)
             if rubbing:
-                batch.forward(ids, VELOCITY_STAGE)
+                if loaded:
+                    batch.forward(ids, VELOCITY_STAGE)
                 state = [live[f][:n] for f in ("qpos", "qvel", "ctrl")]
                 for levels in friction:
-                    levels.set(*state, time, live["qfrc_bias"][:n])
+                    levels.set(*state, time, bias[:n])
                 batch.set_models(models + spare)
             live["qfrc_applied"][:n] = push
             live["xfrc_applied"][:n] = np.where(yes[..., None], *xfrc)
