@@ -1,14 +1,17 @@
-"""Time a diagnosis of 30 s of a two-joint arm, against mujoco.sysid fitting a fixed list of candidates all at once, and of Hopper.
+"""Time a diagnosis of 30 s of a two-joint arm, against mujoco.sysid fitting a fixed list of
+candidates all at once, and of Hopper.
 
     python benchmarks/diagnose.py [--seconds 30]        # -> results/diagnose.csv
 
-Hidden in the arm: Coulomb friction in the elbow. sysid is told the candidates (mass, armature, damping, frictionloss: eight
-parameters), true start velocities and one-second sequences; the diagnosis is told nothing. mujoco.sysid needs extra
-packages (requirements-extras.txt); without them only the diagnosis is timed. Hidden in Hopper: a torso 27 % heavier, in
-falls of 1.5 s each. Seconds are those of the clock, and of all threads together.
+Hidden in the arm: Coulomb friction in the elbow. sysid is told the candidates (mass, armature,
+damping, frictionloss: eight parameters), true start velocities and one-second sequences; the
+diagnosis is told nothing. mujoco.sysid needs extra packages (requirements-extras.txt); without them
+only the diagnosis is timed. Hidden in Hopper: a torso 27 % heavier, in falls of 1.5 s each. Seconds
+are those of the clock, and of all threads together.
 """
 
 import argparse
+import itertools
 import sys
 import time
 from pathlib import Path
@@ -24,14 +27,35 @@ from diagnosis.common.atomic_files import write_table  # noqa: E402
 from diagnosis.recordings.recording import Recording  # noqa: E402
 from envs import model_path  # noqa: E402
 
-ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><default><geom contype="0" conaffinity="0"/>
-<joint axis="0 1 0" damping="0.05" armature="0.01"/></default><worldbody><body name="upper"><joint name="shoulder"/>
-<geom type="capsule" fromto="0 0 0 0 0 -.35" size=".03" mass="1"/><body name="fore" pos="0 0 -.35"><joint name="elbow"/>
-<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".025" mass=".6"/></body></body></worldbody>
-<actuator><motor name="a" joint="shoulder"/><motor name="b" joint="elbow"/></actuator>
-<sensor><jointpos name="shoulder_pos" joint="shoulder"/><jointpos name="elbow_pos" joint="elbow"/></sensor></mujoco>"""
+ARM = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <default>
+    <geom contype="0" conaffinity="0"/>
+    <joint axis="0 1 0" damping="0.05" armature="0.01"/>
+  </default>
+  <worldbody>
+    <body name="upper">
+      <joint name="shoulder"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.35" size=".03" mass="1"/>
+      <body name="fore" pos="0 0 -.35">
+        <joint name="elbow"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".025" mass=".6"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="a" joint="shoulder"/>
+    <motor name="b" joint="elbow"/>
+  </actuator>
+  <sensor>
+    <jointpos name="shoulder_pos" joint="shoulder"/>
+    <jointpos name="elbow_pos" joint="elbow"/>
+  </sensor>
+</mujoco>"""
 NOISE, FRICTION, HEAVIER = 5e-4, 0.1, 1.27
 FALL = 1.5  # s
+COLUMNS = "system method parameter value low high truth seconds cpu_seconds".split()
 
 
 def arm(seconds, seed):
@@ -57,7 +81,8 @@ def hopper(seconds, seed):
 
 
 def run(model, seconds, seed, interval, strength):
-    """(Recording of noisy positions, true qvel) of a model driven by sines of some strength (nu,)."""
+    """(Recording of noisy positions, true qvel) of a model driven by sines of some strength
+    (nu,)."""
     rng, data, rows = np.random.default_rng(seed), mujoco.MjData(model), round(seconds / interval)
     clock, tones = interval * np.arange(rows), (3, model.nu)
     ctrl = np.array([strength]) * np.sin(
@@ -77,45 +102,41 @@ def run(model, seconds, seed, interval, strength):
     ), qvel
 
 
+def sysid_parameters(sysid):
+    """The eight parameters of the arm that mujoco.sysid is told to fit."""
+    parameters = sysid.ParameterDict()
+
+    def add(name, nominal, low, high, modify):
+        bounds = {"min_value": low, "max_value": high}
+        parameters.add(sysid.Parameter(name, nominal=nominal, **bounds, modifier=modify))
+
+    for body, nominal in (("upper", 1.0), ("fore", 0.6)):
+
+        def weigh(spec, parameter, body=body):
+            spec.body(body).geoms[0].mass = parameter.value[0]
+
+        add(f"mass {body}", nominal, 0.1, 5.0, weigh)
+    # friction that starts at 0 would not move
+    fields = (("armature", 0.01), ("damping", 0.05), ("frictionloss", 0.01))
+    for joint, (field, nominal) in itertools.product(("shoulder", "elbow"), fields):
+
+        def modify(spec, parameter, joint=joint, field=field):
+            if field == "damping":
+                spec.joint(joint).damping[0] = parameter.value[0]
+            else:
+                setattr(spec.joint(joint), field, parameter.value[0])
+
+        add(f"{field} {joint}", nominal, 0.0, 2.0, modify)
+    return parameters
+
+
 def with_sysid(recording, qvel, chunk=100):
     """{parameter: value} by mujoco.sysid from the same rows, or None where it is not installed."""
     from mujoco import sysid
 
     if not hasattr(sysid, "optimize"):
         return None
-    spec, parameters = mujoco.MjSpec.from_string(ARM), sysid.ParameterDict()
-    for body, nominal in (("upper", 1.0), ("fore", 0.6)):
-        parameters.add(
-            sysid.Parameter(
-                f"mass {body}",
-                nominal=nominal,
-                min_value=0.1,
-                max_value=5.0,
-                modifier=lambda s, p, b=body: setattr(s.body(b).geoms[0], "mass", p.value[0]),
-            )
-        )
-    for joint in ("shoulder", "elbow"):
-        for field, nominal in (
-            ("armature", 0.01),
-            ("damping", 0.05),
-            ("frictionloss", 0.01),
-        ):  # at 0 it would not move
-
-            def modify(s, p, j=joint, f=field):
-                if f == "damping":
-                    s.joint(j).damping[0] = p.value[0]
-                else:
-                    setattr(s.joint(j), f, p.value[0])
-
-            parameters.add(
-                sysid.Parameter(
-                    f"{field} {joint}",
-                    nominal=nominal,
-                    min_value=0.0,
-                    max_value=2.0,
-                    modifier=modify,
-                )
-            )
+    spec, parameters = mujoco.MjSpec.from_string(ARM), sysid_parameters(sysid)
     model, names, starts, controls, sensors = spec.compile(), [], [], [], []
     for first in range(0, len(recording.time) - chunk, chunk):
         rows = slice(first, first + chunk)
@@ -161,6 +182,29 @@ def diagnosed(system, model, train, held_out):
     ]
 
 
+def sysid_rows(recording, qvel):
+    """Rows of what mujoco.sysid finds in the arm; none where it fails."""
+    begun = spent()
+    try:
+        found = with_sysid(recording, qvel)
+    # an optional package: that it fails is a result, not a fault of ours
+    except Exception as error:
+        found = None
+        print(f"mujoco.sysid failed: {type(error).__name__}: {error}", file=sys.stderr)
+    same = {"system": "two-joint arm", "method": "sysid", **times(spent() - begun)}
+    return [{**same, "parameter": name, "value": value} for name, value in (found or {}).items()]
+
+
+def truths():
+    """{parameter and place: true value} of both systems."""
+    torso = mujoco.MjModel.from_xml_path(str(model_path("Hopper-v4"))).body("torso").mass[0]
+    friction = {"frictionloss shoulder": 0.0, "frictionloss elbow": FRICTION}
+    masses = {"mass upper": 1.0, "mass fore": 0.6, "mass torso": HEAVIER * torso}
+    nominal = (("armature", 0.01), ("damping", 0.05))
+    joints = itertools.product(("shoulder", "elbow"), nominal)
+    return friction | masses | {f"{field} {joint}": value for joint, (field, value) in joints}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=30.0, help="of recorded motion, in all")
@@ -172,61 +216,13 @@ def main():
     rows = diagnosed(
         "two-joint arm", mujoco.MjSpec.from_string(ARM), [train], [arm(0.3 * options.seconds, 1)[0]]
     )
-    begun = spent()
-    try:
-        found = with_sysid(train, qvel)
-    except (
-        Exception
-    ) as error:  # an optional package of changing interface: its failure is a result, not ours
-        found = None
-        print(f"mujoco.sysid failed: {type(error).__name__}: {error}", file=sys.stderr)
-    took = spent() - begun
-    rows += [
-        {
-            "system": "two-joint arm",
-            "method": "sysid",
-            "parameter": name,
-            "value": value,
-            **times(took),
-        }
-        for name, value in (found or {}).items()
-    ]
+    rows += sysid_rows(train, qvel)
     rows += diagnosed("Hopper", "Hopper-v4", falls[:number], falls[number:])
-    torso = mujoco.MjModel.from_xml_path(str(model_path("Hopper-v4"))).body("torso").mass[0]
-    truth = {
-        "mass upper": 1.0,
-        "mass fore": 0.6,
-        "frictionloss shoulder": 0.0,
-        "frictionloss elbow": FRICTION,
-        "mass torso": HEAVIER * torso,
-    }
-    truth |= {
-        f"{field} {joint}": value
-        for joint in ("shoulder", "elbow")
-        for field, value in (("armature", 0.01), ("damping", 0.05))
-    }
+    truth = truths()
     options.out.parent.mkdir(exist_ok=True)
-    write_table(
-        options.out,
-        (
-            "system",
-            "method",
-            "parameter",
-            "value",
-            "low",
-            "high",
-            "truth",
-            "seconds",
-            "cpu_seconds",
-        ),
-        (
-            {
-                k: f"{v:.5g}" if isinstance(v, float) else v
-                for k, v in {**row, "truth": truth.get(row["parameter"])}.items()
-            }
-            for row in rows
-        ),
-    )
+    rows = [{**row, "truth": truth.get(row["parameter"])} for row in rows]
+    short = lambda value: f"{value:.5g}" if isinstance(value, float) else value
+    write_table(options.out, COLUMNS, [{k: short(v) for k, v in row.items()} for row in rows])
     print(options.out.read_text())
 
 

@@ -1,9 +1,11 @@
-"""Which law of drag do the dropped balls themselves say? Plain least squares, without the diagnosis: results/drag_laws.csv.
+"""Which law of drag do the dropped balls themselves say? Plain least squares, without the
+diagnosis: results/drag_laws.csv.
 
     python benchmarks/drag_laws.py [--recordings ../shared/recordings]
 
-For every drop and law, a force k|v|^p with p = 0 (constant), 1 (viscous), 2 (quadratic), height and speed at the start
-and k are fitted to the whole drop, from 0.3 s on (until then some balls were not released). RMS in metres.
+For every drop and law, a force k|v|^p with p = 0 (constant), 1 (viscous), 2 (quadratic), height and
+speed at the start and k are fitted to the whole drop, from 0.3 s on (until then some balls were not
+released). RMS in metres.
 """
 
 import argparse

@@ -1,6 +1,7 @@
 """The example of the README: a real two-link arm, diagnosed, as numbers and as a picture.
 
-python benchmarks/example.py            # diagnose, write results/example.csv, draw docs/diagnosis.png
+python benchmarks/example.py            # diagnose, write results/example.csv, draw
+docs/diagnosis.png
 python benchmarks/example.py --draw     # only draw what results/example.csv holds
 """
 
@@ -60,64 +61,54 @@ def compute():
 
 
 def draw(rows):
-    """Three panels: elbow angle over time, error against horizon, force left over against velocity."""
+    """Three panels: elbow angle over time, error against horizon, force left over against
+    velocity."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from diagnosis.report.charts import binned
-
-    def columns(panel):
-        return np.array([[float(cell) for cell in row[1:]] for row in rows if row[0] == panel]).T
-
-    plt.rcParams.update(
-        {
-            "font.size": 9,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.grid": True,
-            "grid.color": "#dde3e8",
-        }
-    )
-    figure, (left, middle, right) = plt.subplots(
+    look = {"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True}
+    plt.rcParams.update({"font.size": 9, "grid.color": "#dde3e8", **look})
+    figure, axes = plt.subplots(
         1, 3, figsize=(11, 3.1), width_ratios=(2, 1, 1), layout="constrained"
     )
-    time, *looks = columns("elbow")
-    known = np.isfinite(looks[0])
-    left.plot(
-        time[known],
-        looks[0][known],
-        color=COLOURS["measured"],
-        linewidth=4,
-        alpha=0.3,
-        label="recorded",
-    )
-    for look, values in zip(("nominal", "corrected"), looks[1:]):
-        left.plot(time, values, color=COLOURS[look], linewidth=1.3, label=look)
-    left.set(
-        xlabel="time (s)",
-        ylabel="elbow (rad)",
-        title="held-out recording, predicted 0.3 s at a time",
-    )
-    left.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, -0.01))
-    left.set_ylim(min(looks[0][known]) - 0.9, None)
-    seconds, floor, before, after = columns("horizon")
-    middle.semilogy(seconds, before, color=COLOURS["nominal"])
-    middle.semilogy(seconds, after, color=COLOURS["corrected"])
-    middle.semilogy(seconds, floor, color="#8a949e", linestyle="--")
-    middle.set(xlabel="horizon (s)", ylabel="error (× noise)", title="error against horizon")
-    speed, _, before, after = columns("force")
-    for look, force in (("nominal", before), ("corrected", after)):
-        right.plot(speed, force, ".", markersize=2, alpha=0.3, color=COLOURS[look])
-        right.plot(*binned(speed, force, 16), color=COLOURS[look], linewidth=1.8)
-    right.set(
-        xlabel="elbow velocity (rad/s)",
-        ylabel="force left over (N·m)",
-        title="force left over",
-        xlim=(-7, 7),
-        ylim=(-0.45, 0.45),
-    )
+    for axis, (panel, drawn) in zip(axes, PANELS.items()):
+        drawn(axis, *np.array([[float(x) for x in row[1:]] for row in rows if row[0] == panel]).T)
     os.makedirs(os.path.dirname(PICTURE), exist_ok=True)
     figure.savefig(PICTURE, dpi=110)
+
+
+def draw_elbow(axis, time, measured, nominal, corrected):
+    """Angle over time, recorded and predicted; NaN breaks a line."""
+    known, broad = np.isfinite(measured), {"linewidth": 4, "alpha": 0.3, "label": "recorded"}
+    axis.plot(time[known], measured[known], color=COLOURS["measured"], **broad)
+    for look, values in (("nominal", nominal), ("corrected", corrected)):
+        axis.plot(time, values, color=COLOURS[look], linewidth=1.3, label=look)
+    title = "held-out recording, predicted 0.3 s at a time"
+    axis.set(xlabel="time (s)", ylabel="elbow (rad)", title=title)
+    axis.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, -0.01))
+    axis.set_ylim(min(measured[known]) - 0.9, None)
+
+
+def draw_horizon(axis, seconds, floor, before, after):
+    """Error against horizon, in multiples of the noise."""
+    axis.semilogy(seconds, before, color=COLOURS["nominal"])
+    axis.semilogy(seconds, after, color=COLOURS["corrected"])
+    axis.semilogy(seconds, floor, color="#8a949e", linestyle="--")
+    axis.set(xlabel="horizon (s)", ylabel="error (× noise)", title="error against horizon")
+
+
+def draw_force(axis, speed, _, before, after):
+    """Force left over against velocity, with the medians of its bins."""
+    from diagnosis.report.charts import binned
+
+    for look, force in (("nominal", before), ("corrected", after)):
+        axis.plot(speed, force, ".", markersize=2, alpha=0.3, color=COLOURS[look])
+        axis.plot(*binned(speed, force, 16), color=COLOURS[look], linewidth=1.8)
+    labels = {"xlabel": "elbow velocity (rad/s)", "ylabel": "force left over (N·m)"}
+    axis.set(title="force left over", xlim=(-7, 7), ylim=(-0.45, 0.45), **labels)
+
+
+PANELS = {"elbow": draw_elbow, "horizon": draw_horizon, "force": draw_force}
 
 
 def main():

@@ -1,6 +1,7 @@
 """The README's figures and tables of the grounding runs, drawn from the committed CSVs.
 
-python benchmarks/figures.py        # results/grounding.png, transitions.png, and the tables on the terminal as Markdown
+python benchmarks/figures.py        # results/grounding.png, transitions.png, and the tables on the
+terminal as Markdown
 """
 
 import csv
@@ -49,7 +50,8 @@ def panels(count):
 
 
 def draw_grounding(rows, best):
-    """One panel per task: every seed thin, the mean thick with its standard error, both reference lines."""
+    """One panel per task: every seed thin, the mean thick with its standard error, both reference
+    lines."""
     told = [(key, algos) for key, algos in curves(rows).items() if key[2] == "default"]
     table = dict(
         sorted(told, key=lambda item: "Hopper" not in item[0][0])
@@ -116,7 +118,8 @@ def seeds_of(values):
 
 
 def draw_transitions(rows, best):
-    """Return on real against the real transitions that it took: diagnosis beside RGAT, every seed a line."""
+    """Return on real against the real transitions that it took: diagnosis beside RGAT, every seed a
+    line."""
     mine = [
         r
         for r in rows
@@ -169,7 +172,8 @@ def draw_transitions(rows, best):
 
 
 def table(rows, best):
-    """Markdown: the last step's mean, and the best step re-evaluated on fresh episodes, per task and method."""
+    """Markdown: the last step's mean, and the best step re-evaluated on fresh episodes, per task
+    and method."""
     titles = [
         "task",
         "policy",
@@ -239,7 +243,8 @@ def trpo_table(rows):
 
 
 def settings_table(rows):
-    """Markdown: what a frozen policy returns in the grounded simulator under each variant, and the one-step error; seed by seed."""
+    """Markdown: what a frozen policy returns in the grounded simulator under each variant, and the
+    one-step error; seed by seed."""
     print(
         "\n| method | units of R_AT | f_ψ | γ_AT | max KL | std | error of f_ψ | one-step error | return, stochastic | deterministic |"
     )

@@ -1,9 +1,11 @@
-"""Grounding runs over many seeds: every row of every run's progress.csv, and the best policy's fresh evaluation.
+"""Grounding runs over many seeds: every row of every run's progress.csv, and the best policy's
+fresh evaluation.
 
     python benchmarks/grounding.py --env Hopper-v4 --algos rgat gat sim --seeds 0 1 2 3 4
 
-Appends to results/grounding.csv (a row per grounding step) and results/best.csv (a row per run). Runs that are
-there already are skipped, a run that was cut off goes on where it stopped: call it again until it is done.
+Appends to results/grounding.csv (a row per grounding step) and results/best.csv (a row per run).
+Runs that are there already are skipped, a run that was cut off goes on where it stopped: call it
+again until it is done.
 """
 
 import argparse

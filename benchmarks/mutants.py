@@ -1,11 +1,12 @@
 """One-line faults put into the paper's files, and the test that catches each.
 
-    python benchmarks/mutants.py                   # results/mutants.csv; a few minutes each where all is quiet
+    python benchmarks/mutants.py                   # results/mutants.csv; a few minutes each where
+    all is quiet
     python benchmarks/mutants.py --only envs.py    # those of one file
     python benchmarks/mutants.py --check           # does every edit still fit the code?
 
-Each fault is made in a copy of the code, in which the named tests run until one fails. A row that is there already for
-the same edit is not made again.
+Each fault is made in a copy of the code, in which the named tests run until one fails. A row that
+is there already for the same edit is not made again.
 """
 
 import argparse
@@ -97,7 +98,8 @@ MUTANTS = [  # file, what is wrong, the code, the fault
 
 
 def faulty(file, code, fault):
-    """The text of a file with a fault in it. Raises SystemExit where the code has changed under the edit."""
+    """The text of a file with a fault in it. Raises SystemExit where the code has changed under the
+    edit."""
     text = (ROOT / file).read_text()
     if text.count(code) != 1:
         sys.exit(f"{file}: {text.count(code)} places hold {code!r}: renew this edit in {__file__}")

@@ -1,9 +1,11 @@
-"""Are the paper's three gaps named from one episode? Noisy positions of one real episode, diagnosed: results/paper_gaps.csv.
+"""Are the paper's three gaps named from one episode? Noisy positions of one real episode,
+diagnosed: results/paper_gaps.csv.
 
     python benchmarks/paper_gaps.py [--envs Hopper-v4] [--seeds 0 1 2]
 
-The policy that was trained in the sim acts at random as it learnt on "real" for one episode; what is recorded are the
-positions at every action, with Gaussian noise of 1 mm and 1 mrad, and the actions. One row per finding; finished ones are skipped.
+The policy that was trained in the sim acts at random as it learnt on "real" for one episode; what
+is recorded are the positions at every action, with Gaussian noise of 1 mm and 1 mrad, and the
+actions. One row per finding; finished ones are skipped.
 """
 
 import argparse

@@ -1,9 +1,11 @@
-"""Does a diagnosis predict real recordings as well as what was published of the rig? results/published.csv.
+"""Does a diagnosis predict real recordings as well as what was published of the rig?
+results/published.csv.
 
     python benchmarks/published.py [--recordings ../shared/recordings] [--only emps]
 
-Held-out error (RMS, SI) of the nominal model, with the published effects in it, and with those that the diagnosis found, in the
-windows in which the published effects were tried before. A rig whose recordings are absent is skipped, and keeps its rows.
+Held-out error (RMS, SI) of the nominal model, with the published effects in it, and with those that
+the diagnosis found, in the windows in which the published effects were tried before. A rig whose
+recordings are absent is skipped, and keeps its rows.
 """
 
 import argparse

@@ -2,7 +2,8 @@
 
     python benchmarks/real.py [--recordings ../shared/recordings] [--only emps double_pendulum]
 
-Recordings are not part of this repository; what is absent is skipped, and keeps its rows. One row per finding.
+Recordings are not part of this repository; what is absent is skipped, and keeps its rows. One row
+per finding.
 """
 
 import argparse

@@ -5,7 +5,8 @@ import io
 
 
 def append(path, rows):
-    """Add dicts (columns: the first one's keys) to a CSV in a single write, so that parallel runs do not mix theirs."""
+    """Add dicts (columns: the first one's keys) to a CSV in a single write, so that parallel runs
+    do not mix theirs."""
     path.parent.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")

@@ -1,4 +1,5 @@
-"""Lets stable-baselines3 and sb3-contrib train in our batched environments, raw or grounded, with our settings.
+"""Lets stable-baselines3 and sb3-contrib train in our batched environments, raw or grounded, with
+our settings.
 
 model = trpo_model(BatchEnv("Hopper-v4", 32), TRPOConfig(), seed=0); model.learn(100_000)
 returns = rollouts(ActingPolicy(model), env, 20, seed=0, deterministic=True)[0]
@@ -11,7 +12,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 
 class SB3Env(VecEnv):
-    """A BatchEnv, GroundedEnv or any other SAME_STEP VectorEnv with info["next_obs"], as stable-baselines3 wants it."""
+    """A BatchEnv, GroundedEnv or any other SAME_STEP VectorEnv with info["next_obs"], as
+    stable-baselines3 wants it."""
 
     def __init__(self, env):
         self.env = env
@@ -58,9 +60,11 @@ class SB3Env(VecEnv):
 
 
 def trpo_model(env, config, seed, hidden=(64, 64)):
-    """sb3-contrib's TRPO with a TRPOConfig's settings on one of our environments or on an sb3 VecEnv.
+    """sb3-contrib's TRPO with a TRPOConfig's settings on one of our environments or on an sb3
+    VecEnv.
 
-    What it lacks: the entropy bonus (0 in every preset) and the scaling of the value function's targets.
+    What it lacks: the entropy bonus (0 in every preset) and the scaling of the value function's
+    targets.
     """
     vec = env if isinstance(env, VecEnv) else SB3Env(env)
     if config.normalize_obs:
@@ -79,7 +83,8 @@ def trpo_model(env, config, seed, hidden=(64, 64)):
         line_search_max_iter=config.backtracks,
         n_critic_updates=config.value_epochs,
         target_kl=config.max_kl,
-        sub_sampling_factor=1,  # it would thin out the gradient and the line search too, not the Fisher product alone
+        # it would thin out the gradient and the line search too, not the Fisher product alone
+        sub_sampling_factor=1,
         policy_kwargs={
             "net_arch": {"pi": list(hidden), "vf": list(hidden)},
             "activation_fn": torch.nn.Tanh,
@@ -90,7 +95,8 @@ def trpo_model(env, config, seed, hidden=(64, 64)):
 
 
 class ActingPolicy:
-    """A trained sb3 model with our policies' mean() and act(), so that both are judged by the same episodes."""
+    """A trained sb3 model with our policies' mean() and act(), so that both are judged by the same
+    episodes."""
 
     def __init__(self, model):
         self.policy, self.normalizer = model.policy, model.get_vec_normalize_env()

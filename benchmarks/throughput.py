@@ -1,14 +1,16 @@
-"""Environment steps per second: (a) bare physics, (b) TRPO end to end, (c) sb3-contrib's TRPO; all in one run.
+"""Environment steps per second: (a) bare physics, (b) TRPO end to end, (c) sb3-contrib's TRPO; all
+in one run.
 
     python benchmarks/throughput.py
 
-(a) steps a mujoco.batch.Batch under random actions and puts fallen robots back on their feet, no more.
-(b) is train.py's learner: acting, stepping, advantages, and the update of policy and value.
-(c) is sb3-contrib's TRPO with the same settings and batch size: in one environment of gymnasium's, as it comes,
+(a) steps a mujoco.batch.Batch under random actions and puts fallen robots back on their feet, no
+more. (b) is train.py's learner: acting, stepping, advantages, and the update of policy and value.
+(c) is sb3-contrib's TRPO with the same settings and batch size: in one environment of gymnasium's,
+as it comes,
     and in our batched environment through benchmarks/sb3_adapter.py.
-The four alternate for several rounds; medians of the rates and of each round's ratios are printed and written
-to results/throughput.csv. Each task and number of environments has a process of its own, whose peak after (a) and (b),
-less what importing torch took, is the memory.
+The four alternate for several rounds; medians of the rates and of each round's ratios are printed
+and written to results/throughput.csv. Each task and number of environments has a process of its
+own, whose peak after (a) and (b), less what importing torch took, is the memory.
 """
 
 import argparse
@@ -89,7 +91,8 @@ class SB3:
 
 
 def measure(env_id, num_envs, args):
-    """Rates (rounds, 4) in steps/s of physics, ours, sb3 as it comes, sb3 on our environment; and MiB beyond torch."""
+    """Rates (rounds, 4) in steps/s of physics, ours, sb3 as it comes, sb3 on our environment; and
+    MiB beyond torch."""
     if args.threads:
         torch.set_num_threads(args.threads)
     batch = PRESETS[env_id.split("-")[0]].batch_size

@@ -1,11 +1,13 @@
-"""What decides whether g_phi learns: one grounding step from the same data under different settings.
+"""What decides whether g_phi learns: one grounding step from the same data under different
+settings.
 
     python benchmarks/transformer_settings.py --env Hopper-v4 --seeds 0
 
-Appends to results/transformer_settings.csv: the one-step error on held-out real transitions that a transformer
-leaves, and the return that the same frozen policy gets in the grounded simulator: it should be the real one.
-Variants "sim", "real" and "oracle" are the raw worlds and the perfect transformer, "raw" is R_AT with its
-dimensions in SI units, not in those of a real step. Rows that exist are skipped.
+Appends to results/transformer_settings.csv: the one-step error on held-out real transitions that a
+transformer leaves, and the return that the same frozen policy gets in the grounded simulator: it
+should be the real one. Variants "sim", "real" and "oracle" are the raw worlds and the perfect
+transformer, "raw" is R_AT with its dimensions in SI units, not in those of a real step. Rows that
+exist are skipped.
 """
 
 import argparse

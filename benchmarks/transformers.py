@@ -1,11 +1,14 @@
-"""The paper's look at the action transformers: a_hat against a after one grounding step, GAT beside RGAT.
+"""The paper's look at the action transformers: a_hat against a after one grounding step, GAT beside
+RGAT.
 
-    python benchmarks/transformers.py [--seeds 0 1 2]     # results/transformers.csv, transformer_points.csv, transformers.png
+    python benchmarks/transformers.py [--seeds 0 1 2]     # results/transformers.csv,
+    transformer_points.csv, transformers.png
     python benchmarks/transformers.py --draw              # the picture alone, from the CSVs
 
-InvertedPendulum-v4; the real pole weighs the same as the sim's (sim-to-self), more, or less; f_psi is the paper's plain
-network, or corrects the sim. Points are the (s, a) of held-out real episodes of the stochastic policy; those of seed 0
-are kept and drawn. Rows of seeds that are there already with this version are not made again.
+InvertedPendulum-v4; the real pole weighs the same as the sim's (sim-to-self), more, or less; f_psi
+is the paper's plain network, or corrects the sim. Points are the (s, a) of held-out real episodes
+of the stochastic policy; those of seed 0 are kept and drawn. Rows of seeds that are there already
+with this version are not made again.
 """
 
 import argparse
@@ -84,7 +87,8 @@ def transformed(sim, transformer, transitions):
 
 
 def draw():
-    """transformers.png: a panel per world and method, each f_psi in its colour, with every seed's mean RMS."""
+    """transformers.png: a panel per world and method, each f_psi in its colour, with every seed's
+    mean RMS."""
     from matplotlib.figure import Figure
 
     points, rows = read(CSV.with_name("transformer_points.csv")), read(CSV)

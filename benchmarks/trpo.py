@@ -1,12 +1,15 @@
 """How well TRPO learns, beside sb3-contrib's TRPO with the same settings in the same environments.
 
-    python benchmarks/trpo.py                                          # everything, one after the other
+    python benchmarks/trpo.py                                          # everything, one after the
+    other
     python benchmarks/trpo.py --implementations ours --envs Hopper-v4 --seeds 0 1 2 --threads 1
-    python benchmarks/trpo.py --implementations ours --envs HalfCheetah-v4 --seeds 100 101 102 --max-kl 0.04
+    python benchmarks/trpo.py --implementations ours --envs HalfCheetah-v4 --seeds 100 101 102
+    --max-kl 0.04
 
-Appends a row per finished training to results/trpo.csv and skips what is there, so parts may run side by side and
-be stopped at will. An environment is a gymnasium id, perturbed if a change follows: "Hopper-v4 torso:mass*1.27".
-Each policy is judged by 20 episodes acting by its mean and 20 acting at random as it learnt; seconds are CPU time.
+Appends a row per finished training to results/trpo.csv and skips what is there, so parts may run
+side by side and be stopped at will. An environment is a gymnasium id, perturbed if a change
+follows: "Hopper-v4 torso:mass*1.27". Each policy is judged by 20 episodes acting by its mean and 20
+acting at random as it learnt; seconds are CPU time.
 """
 
 import argparse

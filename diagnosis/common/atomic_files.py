@@ -1,4 +1,5 @@
-"""Files written whole or not at all: a reader, and whoever stops the program, never sees half of one.
+"""Files written whole or not at all: a reader, and whoever stops the program, never sees half of
+one.
 
 write_whole(path, "text or bytes")
 write_together({path: "text", other: b"bytes"})     # none takes its name before all are complete
@@ -21,9 +22,11 @@ def write_whole(path, data):
 
 
 def write_together(files):
-    """Write {path: text or bytes}, each under a temporary name beside it; the names change once all are on the disk.
+    """Write {path: text or bytes}, each under a temporary name beside it; the names change once all
+    are on the disk.
 
-    Raises WriteError, and then leaves what was there before (but where the change of names itself fails half-way).
+    Raises WriteError, and then leaves what was there before (but where the change of names itself
+    fails half-way).
     """
     waiting = {}
     try:
@@ -52,7 +55,8 @@ def write_together(files):
 
 
 def write_table(path, columns, rows):
-    """A CSV: a header, then the dicts of rows; missing cells stay empty, other keys are left out. Raises WriteError."""
+    """A CSV: a header, then the dicts of rows; missing cells stay empty, other keys are left out.
+    Raises WriteError."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore")
     writer.writeheader()

@@ -8,7 +8,8 @@ import mujoco
 
 @contextmanager
 def quiet():
-    """No warnings on the terminal or in MUJOCO_LOG.TXT, from MuJoCo's compiler or from unstable simulations."""
+    """No warnings on the terminal or in MUJOCO_LOG.TXT, from MuJoCo's compiler or from unstable
+    simulations."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
