@@ -13,7 +13,6 @@ Nothing is sealed here. The CSV is written after each trial; trials that it hold
 
 import argparse
 import csv
-import json
 import os
 import shutil
 import sys
@@ -30,9 +29,10 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
 from diagnosis.common.atomic_files import write_table  # noqa: E402
-from diagnosis.trials.drawing import draw_trial, write_folder  # noqa: E402
-from diagnosis.trials.prediction import model_error, system_error  # noqa: E402
-from diagnosis.trials.replay import load_runs, replay, save_runs  # noqa: E402
+from diagnosis.trials.drawing import draw_trial  # noqa: E402
+from diagnosis.trials.kept import BENCH, HELD_OUT, is_kept, keep, read_answer  # noqa: E402
+from diagnosis.trials.prediction import model_error  # noqa: E402
+from diagnosis.trials.replay import load_runs, replay  # noqa: E402
 from diagnosis.trials.robots import DEVELOPMENT  # noqa: E402
 from diagnosis.trials.scoring import beside, score_findings  # noqa: E402
 from diagnosis.trials.tools import run_tool  # noqa: E402
@@ -61,21 +61,7 @@ class Job:
 def draw(seed, number, cache):
     """Draw a trial into cache/SEED_NUMBER, unless it is there; returns that folder."""
     folder = Path(cache) / f"{seed}_{number}"
-    if not (folder / "answer.json").exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        trial = draw_trial((seed, number), DEVELOPMENT)
-        (folder / "bench").mkdir(exist_ok=True)
-        write_folder(trial, folder / "bench")
-        save_runs(folder / "held_out.npz", trial.held_out, trial.noise)
-        floor = system_error(trial.system(), trial.held_out, trial.noise)
-        answer = trial.answer | {"error_floor": floor, "noise": trial.noise.tolist()}
-        (folder / "answer.json").write_text(json.dumps(answer))
-    return folder
-
-
-def read_answer(folder):
-    """What a drawn trial hides, and its conditions."""
-    return json.loads((folder / "answer.json").read_text())
+    return folder if is_kept(folder) else keep(draw_trial((seed, number), DEVELOPMENT), folder)
 
 
 def place(item):
@@ -97,11 +83,11 @@ def said(finding):
 
 def score(job):
     """One row of the table: the tool runs in a folder of its own, so that several may at once."""
-    answer = read_answer(job.folder)
-    held_out = job.folder / "held_out.npz"
+    answer, floor = read_answer(job.folder)
+    held_out = job.folder / HELD_OUT
     with tempfile.TemporaryDirectory() as parent:
         bench = shutil.copytree(
-            job.folder / "bench", Path(parent) / "bench", ignore=shutil.ignore_patterns("report")
+            job.folder / BENCH, Path(parent) / "run", ignore=shutil.ignore_patterns("report")
         )
         names = sorted(path.name for path in bench.glob("train_*.csv"))
         done = run_tool(job.tool, bench, names, job.limit)
@@ -117,7 +103,7 @@ def score(job):
         "prediction": "" if after is None else f"{after / before:.4g}",
         "error_before": f"{before:.4g}",
         "error_after": "" if after is None else f"{after:.4g}",
-        "error_floor": f"{answer['error_floor']:.4g}",
+        "error_floor": f"{floor:.4g}",
         "seconds": f"{done.cpu_seconds:.1f}",
         "steps": ((summary or {}).get("cost") or {}).get("steps", ""),
         "note": done.note,
@@ -226,9 +212,9 @@ def chosen(options):
     folders = {int(f.name.split("_")[1]): f for f in options.cache.glob(f"{options.seed}_*")}
     out = []
     for number, folder in sorted(folders.items()):
-        if not (folder / "answer.json").exists():
+        if not is_kept(folder):
             continue
-        answer = read_answer(folder)
+        answer, _ = read_answer(folder)
         if options.only and number not in numbers(options.only):
             continue
         if answer["kind"] in options.kinds.split(",") and not (options.free and answer["touched"]):

@@ -22,6 +22,7 @@ from diagnosis.common.atomic_files import WriteError, write_whole
 from diagnosis.trials import page as proof_page
 from diagnosis.trials.audit import audit
 from diagnosis.trials.drawing import answer_text, draw_trial, write_folder
+from diagnosis.trials.kept import is_kept
 from diagnosis.trials.robots import DEVELOPMENT
 from diagnosis.trials.sealing import (
     SealError,
@@ -64,6 +65,7 @@ def parse(words):
     source.add_argument("--seals", type=Path, help="published seals; keys are read from SEALS.keys")
     command.add_argument("--seed", type=int, default=1, help="of the development trials")
     command.add_argument("--trials", type=int, help="trials 0 .. N-1 (all that are sealed)")
+    command.add_argument("--drawn", type=Path, help="folder where development trials are kept")
     command.add_argument("--out", type=Path, required=True, help="CSV; trials in it are not rerun")
     command.add_argument("--tool", default=DIAGNOSE, help="command line of the tool to score")
     command.add_argument("--limit", type=int, default=900, help="processor seconds for a trial")
@@ -103,7 +105,9 @@ def do_run(options):
     """Run what is not in the table yet."""
     if options.development:
         count = 60 if options.trials is None else options.trials
-        tasks = [Task(n, (options.seed, n), "development") for n in range(count)]
+        tasks = [
+            Task(n, (options.seed, n), "development", drawn=kept(options, n)) for n in range(count)
+        ]
     else:
         tasks = sealed_tasks(options.seals)[: options.trials]
     run_tasks(
@@ -115,6 +119,16 @@ def do_run(options):
         options.ray,
         options.minutes,
     )
+
+
+def kept(options, number):
+    """The folder of a development trial that benchmarks/development.py has drawn; "" for none."""
+    if options.drawn is None:
+        return ""
+    folder = options.drawn.resolve() / f"{options.seed}_{number}"
+    if not is_kept(folder):
+        raise SealError(f"{folder}: no drawn trial; see benchmarks/development.py draw")
+    return str(folder)
 
 
 def sealed_tasks(path):

@@ -203,14 +203,13 @@ def axes(result):
         ("comes and goes", a["gate"] or "always there"),
     ]
     flags = {
-        "contact": "through contacts",
-        "stops": "joint ranges",
-        "free_base": "free base",
         "mimic": "behind a mimic",
         "fitted_without": "behind fitted nominal values",
         "motorless": "joint without motor",
     }
     pairs += [("hidden", text) for flag, text in flags.items() if a.get(flag)]
+    touch = "joint ranges" if a["stops"] else "a free base's feet" if a["free_base"] else "a foot"
+    pairs.append(("touches", touch if a["touched"] else "nothing"))
     if any(item["removed"] for item in a["hidden"]):
         pairs.append(("hidden", "nominal has too much"))
     if result.needed:

@@ -11,6 +11,7 @@ import itertools
 import json
 import math
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -23,10 +24,11 @@ import mujoco
 from tqdm import tqdm
 
 from diagnosis.common.atomic_files import write_table
-from diagnosis.trials.drawing import answer_text, draw_trial, write_folder
-from diagnosis.trials.prediction import model_error, system_error
-from diagnosis.trials.replay import replay, save_runs
-from diagnosis.trials.robots import DEVELOPMENT, FINAL, to_mjcf
+from diagnosis.trials.drawing import answer_text, draw_trial
+from diagnosis.trials.kept import BENCH, HELD_OUT, keep, read_answer
+from diagnosis.trials.prediction import model_error
+from diagnosis.trials.replay import load_runs, replay
+from diagnosis.trials.robots import DEVELOPMENT, FINAL
 from diagnosis.trials.scoring import Score, score_findings
 from diagnosis.trials.tools import run_tool
 
@@ -42,7 +44,8 @@ COLUMNS = tuple(
 @dataclass(frozen=True)
 class Task:
     """A trial to run. key: integers it is drawn from; secret: what the seal hides, revealed in the
-    row; seals: the commit that published the seals ("" in development)."""
+    row; seals: the commit that published the seals ("" in development); drawn: the folder of a
+    trial that was kept, which is not drawn again."""
 
     number: int
     key: tuple
@@ -50,35 +53,37 @@ class Task:
     secret: str = ""
     seals: str = ""
     version: str = ""
+    drawn: str = ""
 
 
 def run_trial(task, template, limit=900):
     """Draw a trial, run the tool on it, score what it wrote. Returns a row of the table."""
-    trial = draw_trial(task.key, SETTINGS[task.settings])
-    nominal = mujoco.MjModel.from_xml_string(to_mjcf(trial.nominal))
-    row = {
-        "number": task.number,
-        "key": task.secret or "-".join(map(str, task.key)),
-        "seals": task.seals,
-        "version": task.version,
-        "tool": template,
-        "settings": task.settings,
-        "answer": answer_text(trial.answer),
-        "error_before": model_error(nominal, nominal, trial.held_out, trial.noise),
-        "error_floor": system_error(trial.system(), trial.held_out, trial.noise),
-    }
     with tempfile.TemporaryDirectory() as parent:
-        bench = Path(parent) / "bench"
-        bench.mkdir()
-        done = run_tool(template, bench, write_folder(trial, bench), limit)
+        folder = Path(task.drawn or Path(parent) / "drawn")
+        if not task.drawn:
+            keep(draw_trial(task.key, SETTINGS[task.settings]), folder)
+        answer, floor = read_answer(folder)
+        nominal = mujoco.MjModel.from_xml_path(str(folder / BENCH / "sim.xml"))
+        row = {
+            "number": task.number,
+            "key": task.secret or "-".join(map(str, task.key)),
+            "seals": task.seals,
+            "version": task.version,
+            "tool": template,
+            "settings": task.settings,
+            "answer": answer_text(answer),
+            "error_before": model_error(nominal, nominal, *load_runs(folder / HELD_OUT)),
+            "error_floor": floor,
+        }
+        bench = shutil.copytree(folder / BENCH, Path(parent) / "run")
+        names = sorted(path.name for path in bench.glob("train_*.csv"))
+        done = run_tool(template, bench, names, limit)
         row |= {"exit": done.exit, "seconds": done.seconds, "cpu_seconds": done.cpu_seconds}
         row["note"] = done.note
         if done.exit == 0 and (done.report / "corrected.xml").exists():
-            held_out = Path(parent) / "held_out.npz"
-            save_runs(held_out, trial.held_out, trial.noise)
-            row["error_after"] = replay(bench / "sim.xml", done.report, held_out)
+            row["error_after"] = replay(bench / "sim.xml", done.report, folder / HELD_OUT)
         summary = done.summary() if done.exit == 0 else None
-    return plain(row | judged(trial.answer, summary))
+    return plain(row | judged(answer, summary))
 
 
 def judged(answer, summary):
