@@ -45,7 +45,8 @@ def audit(table, seals, redraw=None, jobs=1):
     for row in rows:
         check_row(row, published, commit)
     yield f"{len(rows)} rows: every key is the one that was sealed, every score follows the rules"
-    chosen = rows if redraw is None else rows[:: max(1, len(rows) // redraw)][:redraw]
+    redraw = len(rows) if redraw is None else redraw
+    chosen = rows[:: max(1, len(rows) // max(1, redraw))][:redraw]
     with ProcessPoolExecutor(jobs) as pool:
         for row, answer in zip(chosen, pool.map(redrawn, chosen)):
             if not alike(answer, json.loads(row["answer"])):
