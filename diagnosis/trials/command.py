@@ -105,8 +105,10 @@ def do_run(options):
     """Run what is not in the table yet."""
     if options.development:
         count = 60 if options.trials is None else options.trials
+        version = commit_here()
         tasks = [
-            Task(n, (options.seed, n), "development", drawn=kept(options, n)) for n in range(count)
+            Task(n, (options.seed, n), "development", version=version, drawn=kept(options, n))
+            for n in range(count)
         ]
     else:
         tasks = sealed_tasks(options.seals)[: options.trials]
@@ -119,6 +121,15 @@ def do_run(options):
         options.ray,
         options.minutes,
     )
+
+
+def commit_here():
+    """The commit that is checked out, "+" behind it where files differ; "" without a history."""
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no", folder=ROOT)
+        return git("rev-parse", "HEAD", folder=ROOT) + ("+" if changed else "")
+    except SealError:
+        return ""
 
 
 def kept(options, number):

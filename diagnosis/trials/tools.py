@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+CLOCK = 10  # seconds of the clock that a tool gets for each of the processor: cores may be busy
 FRONT = ROOT / "diagnose.py"  # of a clone; where the package is installed there is none
 DIAGNOSE = (
     f"{{python}} {FRONT if FRONT.exists() else '-m diagnosis'} "
@@ -65,12 +66,12 @@ def run_tool(template, folder, recordings, limit):
             text=True,
             errors="replace",
             stdin=subprocess.DEVNULL,
-            timeout=3 * limit,
+            timeout=CLOCK * limit,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit)),
         )
         status, text = done.returncode, done.stderr
     except subprocess.TimeoutExpired:
-        status, text = -9, f"no answer in {3 * limit} s"
+        status, text = -9, f"no answer in {CLOCK * limit} s"
     except OSError as error:
         status, text = 127, f"cannot be started: {error}"
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
