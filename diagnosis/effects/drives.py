@@ -354,6 +354,36 @@ class GainFade(DriveLimit):
         return lost(models, i, lambda force, speed, time: force * np.expm1(-values[:, 0] * time))
 
 
+@catalogue
+class EffortFade(DriveLimit):
+    """A motor weakens with what it has done: u exp(−per_effort · ∫ (u/u₀)² dt), per_effort in 1/s.
+
+    u₀ is its largest control, so per_effort is the rate at full control: heat by its current, a
+    supply
+    that sags as it is drained. It has the name of GainFade, which falls whatever the motor does.
+    """
+
+    name, law, amplitudes, simplicity = "gain_fade", "effort_fade", 1, 3
+    related = ("gain",)
+
+    def fits(self, model, i):
+        return super().fits(model, i) and not model.actuator_biasprm[i, :3].any()
+
+    def parameters(self, model, i):
+        return (Parameter("per_effort", "1/s", 0.0, 0.0, 10.0, 0.01),)
+
+    @staticmethod
+    def _full(model, i):
+        return DriveLimit.strength(model, i) / max(abs(model.actuator_gainprm[i, 0]), 1e-12)
+
+    def command(self, signal, model, i, values):
+        return replace(signal, tires=signal.tires + values[0] / self._full(model, i) ** 2)
+
+    def part(self, model, i, values):
+        tires = float(values[0] / self._full(model, i) ** 2)
+        return Part(self.law, model.actuator(i).name, {"tires": tires})
+
+
 def friction_curve(model, joint, knots):
     """Candidate for a friction map of any shape in a joint: see FrictionCurve. Parameters: the
     level at each knot."""

@@ -489,11 +489,16 @@ class Backlash(JointEffect):
         position, _ = self.travel(model, i, recordings)
         return np.ptp(position) * np.array([[0.01], [0.04]])
 
+    def _load(self, model, i):
+        """Name of the joint that carries the load."""
+        return f"{self.name}:{model.joint(i).name}"
+
     def build(self, spec, model, i):
         motor = spec.joint(model.joint(i).name)
-        motor.armature = max(motor.armature, 0.01 * self.scale(model, i))
+        if motor.armature == model.dof_armature[model.jnt_dofadr[i]]:  # else another one was found
+            motor.armature = max(motor.armature, 0.01 * self.scale(model, i))
         load = motor.parent.add_joint(
-            name=f"backlash:{motor.name}",
+            name=self._load(model, i),
             type=motor.type,
             pos=model.jnt_pos[i],
             axis=model.jnt_axis[i],
@@ -508,10 +513,7 @@ class Backlash(JointEffect):
         return load
 
     def edit(self, model, i, values):
-        model.jnt_range[model.joint(f"backlash:{model.joint(i).name}").id] = (
-            -values[0] / 2,
-            values[0] / 2,
-        )
+        model.jnt_range[model.joint(self._load(model, i)).id] = -values[0] / 2, values[0] / 2
 
     def write(self, spec, model, i, values):
         self.build(spec, model, i).range = [

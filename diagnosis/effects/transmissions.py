@@ -162,16 +162,13 @@ class JointElasticity(Backlash):
     def possible(self, values, nominal):
         return np.isfinite(values[0])
 
-    def _spring(self, model, i):
-        return f"joint_elasticity:{model.joint(i).name}"
-
     def build(self, spec, model, i):
         load = super().build(spec, model, i)
-        load.name, load.limited = self._spring(model, i), mujoco.mjtLimited.mjLIMITED_FALSE
+        load.limited = mujoco.mjtLimited.mjLIMITED_FALSE
         return load
 
     def edit(self, model, i, values):
-        joint = model.joint(self._spring(model, i)).id
+        joint = model.joint(self._load(model, i)).id
         motor, _ = self._inertias(model, i)
         stiffness = min(values[0], motor / model.opt.timestep**2)
         model.jnt_stiffness[joint], model.dof_damping[model.jnt_dofadr[joint]] = (

@@ -22,8 +22,21 @@ class Signal:
     delay: float = 0.0
     lag: float = 0.0
     rate: float = np.inf
+    tires: float = 0.0
 
     def sample(self, start, step, count, average):
+        """What the actuator sees in each of `count` steps of `step` seconds from time `start`,
+        (count,).
+
+        As passed(), but for what it tires."""
+        seen = self.passed(start, step, count, average)
+        if self.tires:
+            begins = start + step * np.arange(count)
+            worked = replace(self, value=self.value**2).integral(begins)
+            seen = seen * np.exp(-self.tires * np.maximum(worked, 0.0))
+        return seen
+
+    def passed(self, start, step, count, average):
         """What the actuator sees in each of `count` steps of `step` seconds from time `start`,
         (count,).
 

@@ -222,10 +222,18 @@ def rate_limit(look, wanted, memory, rate):
     return value + np.sign(gap) * (rate * reached**2 / 2 + abs(gap) * (h - reached)) / h
 
 
+def effort_fade(look, wanted, memory, tires):
+    """The control loses exp(−tires · E), E the integral of its square since the run began."""
+    before, effort, since = memory.get("effort", (wanted, 0.0, look.time))
+    effort = np.where(look.time < since, 0.0, effort + before**2 * (look.time - since))
+    memory["effort"] = np.copy(wanted), effort, np.copy(look.time)
+    return wanted * np.exp(-tires * effort)
+
+
 FRICTION = {f.__name__: f for f in (load_friction, friction_wave, friction_curve)}
 FORCE = {f.__name__: f for f in (curve, wave, surface)}
 DRIVE = {f.__name__: f for f in (dead_zone_of_force, torque_speed, gain_fade)}
-CONTROL = {f.__name__: f for f in (dead_zone, rate_limit)}
+CONTROL = {f.__name__: f for f in (dead_zone, rate_limit, effort_fade)}
 
 
 # running
@@ -390,6 +398,7 @@ def predict(model, time, qpos, qvel, ctrl, windows, run_up=0.5):
     data, out = mujoco.MjData(model), []
     for first, last in windows:
         early = int(np.searchsorted(time, time[first] - run_up - 1e-9))
+        early = 0 if any(law == "effort_fade" for law, _, _ in PARTS) else early
         while early < first and not np.isfinite([*qpos[early], *qvel[early]]).all():
             early += 1
         begin(model, data, ctrl[early], time[early])

@@ -6,7 +6,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from plants import SIZES, arm, commanded, pendulum, stock
+from plants import PENDULUM, SIZES, START, arm, commanded, pendulum, record, simulate, stock
 
 from diagnosis.effects.drives import FrictionCurve, friction_curve
 from diagnosis.simulation.control_signal import Signal
@@ -314,6 +314,44 @@ def test_what_a_drive_cannot_give(effect):
     qpos = run(world, {world.candidate(effect, "m"): values}, recording, 0.0, 0.0)
     assert abs(qpos - expected).max() < 6e-3
     assert abs(run(world, {}, recording, 0.0, 0.0) - expected).max() > 0.05
+
+
+def test_a_motor_that_tires_with_its_effort():
+    """Its control is less by exp(−rate · ∫ (u/u₀)² dt), by hand; u₀ is the end of its range."""
+    xml = PENDULUM.format("implicitfast").replace('name="m"', 'name="m" ctrlrange="-2 2"')
+    world, recording = World(mujoco.MjSpec.from_string(xml)), waves(1.2)
+    candidate = next(
+        c for c in world.candidates if [p.name for p in c.parameters] == ["per_effort"]
+    )
+    worked, q, v, expected = 0.0, 0.0, 0.0, [0.0]
+    for u in recording.ctrl[:-1, 0]:
+        for _ in range(round(DT / 1e-5)):
+            worked += 1e-5 * (u / 2) ** 2
+            v += 1e-5 / INERTIA * (u * np.exp(-3.0 * worked) - WEIGHT * np.sin(q))
+            q += 1e-5 * v
+        expected.append(q)
+    qpos = run(world, {candidate: (3.0,)}, recording, 0.0, 0.0)
+    assert abs(run(world, {}, recording, 0.0, 0.0) - expected).max() > 0.3
+    assert abs(qpos - expected).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    "kind, together",
+    [
+        ("motors", {"presliding": "elbow", "joint_elasticity": "elbow"}),
+        ("servos", {"armature": "lift", "joint_elasticity": "lift"}),
+        ("euler", {"armature": "elbow", "backlash": "elbow", "presliding": "elbow"}),
+    ],
+)
+def test_parts_that_stand_beside_each_other_are_the_same_in_mjcf(kind, together):
+    world, _ = arm(kind)
+    recording = record(world)
+    setting = {world.candidate(name, place): SIZES[name] for name, place in together.items()}
+    xml, written = world.corrected_xml(setting)
+    assert set(written.values()) == {"mjcf"}
+    expected = simulate(world, [setting], recording, 25)[0]
+    there = stock(xml, world, recording, *START, 25)
+    np.testing.assert_allclose(there, expected, rtol=0, atol=1e-9)
 
 
 def test_a_limited_rate_passes_delays_and_lags_on():

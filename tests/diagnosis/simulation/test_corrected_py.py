@@ -98,7 +98,7 @@ def test_the_script_is_the_simulator(tmp_path, kind):
         assert set(written.values()) == {"python"} and len(parts) == 1 and not xml_holds(written)
         qpos = in_script(tmp_path, parts, recording)
         np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9, err_msg=str(parts))
-        assert abs(expected - nominal).max() > 1e-4, parts
+        assert abs(expected - nominal).max() > 1e-5, parts
 
 
 def test_several_at_once_and_beside_what_mjcf_holds(tmp_path):
