@@ -1,0 +1,92 @@
+"""README and docs: links lead somewhere, tables say what made them, sentences are short."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results/README.md"]
+PAGES += sorted((ROOT / "docs").glob("*.md"))
+WORDS = 25  # of a sentence
+SHORT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")]
+SHORT += [ROOT / "docs" / f"{name}.md" for name in ("index", "diagnosis-json", "limits")]
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def prose(page):
+    """The text of a page without fenced blocks, where brackets mean something else."""
+    return re.sub(r"(?ms)^```.*?^```", "", page.read_text(encoding="utf-8"))
+
+
+def anchors(page):
+    """The fragments that a page's headings answer to: lower case, words joined by hyphens."""
+    heads = re.findall(r"(?m)^#+ (.+)$", prose(page))
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+def broken(page):
+    """Relative links of a page that lead nowhere."""
+    found = []
+    for link in LINK.findall(prose(page)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, fragment = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (fragment and fragment not in anchors(target)):
+            found.append(link)
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_relative_links_lead_somewhere(page):
+    assert broken(page) == []
+
+
+def test_a_broken_link_is_seen(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# One two\n[a](gone.md) [b](#one-two) [c](#three) [d](https://e.org/f)\n")
+    assert broken(page) == ["gone.md", "#three"]
+
+
+def test_every_page_is_in_the_navigation():
+    listed = re.findall(r"(?m)^  - .+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text())
+    assert sorted(listed) == sorted(page.name for page in (ROOT / "docs").glob("*.md"))
+
+
+def test_the_readme_is_short_and_has_its_test_command():
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 150
+    marker = lines.index("<!-- test -->")
+    assert lines[marker + 1] == "```bash" and "pytest" in lines[marker + 2]
+
+
+def test_every_table_says_what_made_it():
+    """results/README.md lists each table, and the scripts it names are there."""
+    index = (ROOT / "results/README.md").read_text(encoding="utf-8")
+    tables = {path.name for path in (ROOT / "results").glob("*.csv")}
+    assert {name for name in tables if f"`{name}`" not in index} == set(), (
+        "list it, with its command"
+    )
+    scripts = set(re.findall(r"`python (\S+\.py)", index))
+    assert {name for name in scripts if not (ROOT / name).exists()} == set()
+
+
+def sentences(text):
+    """Sentences of Markdown prose: no code, no tables' frames, links as their words."""
+    text = re.sub(r"(?m)^ {4}.*$|<!--.*?-->", "", text)
+    text = re.sub(r"\]\([^)]*\)", "]", re.sub(r"`[^`]*`", "X", text))
+    for block in re.split(r"\n\s*\n|\n(?=[-*|#]|\d+\. )", text):
+        for cell in block.split("|") if block.startswith("|") else [block]:
+            yield from filter(None, re.split(r"(?<=[.!?:;])\s+", " ".join(cell.split())))
+
+
+@pytest.mark.parametrize("page", SHORT, ids=lambda page: page.name)
+def test_sentences_are_short(page):
+    assert [s for s in sentences(prose(page)) if len(s.split()) > WORDS] == []
+
+
+def test_a_long_sentence_is_seen():
+    long = "word " * 26
+    found = [len(s.split()) for s in sentences(f"Short. {long}end.\n\n    {long}")]
+    assert found == [1, 27]
