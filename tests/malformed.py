@@ -547,8 +547,7 @@ def cases():
         *out,
         more_csv=text(good)[:-20],
     )
-    found.update(of_robots(good))
-    return found
+    return found | of_robots(good)
 
 
 URDF = """<robot name="arm"><link name="base"/><link name="upper"><inertial><mass value="1"/>
