@@ -15,6 +15,7 @@ fault of this program, 130 stopped by Ctrl-C, with one line on stderr.
 import argparse
 import dataclasses
 import glob
+import json
 import os
 import sys
 import traceback
@@ -23,8 +24,10 @@ import mujoco
 import numpy as np
 from tqdm import tqdm
 
-from diagnosis.common.atomic_files import WriteError, write_whole
+from diagnosis.common.atomic_files import WriteError, write_together, write_whole
 from diagnosis.common.mujoco_warnings import quiet
+from diagnosis.design.explanations import DesignError, reached_by
+from diagnosis.design.output import write_next
 from diagnosis.estimator import identify
 from diagnosis.nominal.model import ModelError, gains_of, load_world, together, with_gains
 from diagnosis.nominal.urdf import is_urdf, with_dynamics
@@ -42,6 +45,7 @@ REFUSED = (  # what the user can mend
     ModelError,
     writer.ReportError,
     WriteError,
+    DesignError,
     mujoco.FatalError,
     MemoryError,
 )
@@ -218,14 +222,14 @@ def _parser():
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    nominal = parser.add_mutually_exclusive_group(required=True)
+    nominal = parser.add_mutually_exclusive_group()
     nominal.add_argument("--model", help="MJCF or URDF file of the nominal simulator")
     nominal.add_argument("--env", help="gymnasium id of a MuJoCo environment, instead of --model")
     several = {"nargs": "+", "action": "extend", "metavar": "FILE"}
     what = "to fit: CSV, NPZ, ROS 2 bags, LeRobot or Minari datasets, PACE dictionaries"
-    parser.add_argument("--recordings", required=True, help=f"recordings {what}", **several)
+    parser.add_argument("--recordings", help=f"recordings {what}", **several)
     parser.add_argument("--held-out", help="recordings only predicted, never fitted", **several)
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the report goes")
+    parser.add_argument("--out", metavar="FOLDER", help="where the report goes")
     parser.add_argument("--map", metavar="TOML", help="what the files' columns are")
     parser.add_argument("--degrees", action="store_true", help="angles in the files are in degrees")
     gain = {"nargs": "+", "metavar": "GAIN", "help": "one number, or joint=number for each"}
@@ -239,7 +243,26 @@ def _parser():
     parser.add_argument(
         "--write-urdf", action="store_true", help="corrected.urdf too, with its <dynamics>"
     )
+    parser.add_argument("--next", metavar="REPORT", help="design what to record after a report")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of that (default 10)")
     return parser
+
+
+def _checked(args):
+    """The arguments, where they belong together. Raises ModelError."""
+    if args.next is not None:
+        others = (args.model, args.env, args.recordings, args.out)
+        if any(value is not None for value in others):
+            raise ModelError("--next REPORT: takes --seconds and nothing else")
+        if not 1 <= args.seconds <= 120:
+            raise ModelError(f"--seconds {args.seconds:g}: give 1 to 120")
+        return args
+    if (args.model is None) == (args.env is None):
+        raise ModelError("give one of --model and --env; see --help")
+    for name in ("recordings", "out"):
+        if getattr(args, name) is None:
+            raise ModelError(f"--{name} is missing; see --help")
+    return args
 
 
 def gain_words(option, words):
@@ -284,11 +307,23 @@ def _diagnosed(args, progress):
         skip_meshes=args.skip_meshes,
     )
     files = writer.write(diagnosis, args.out)
+    write_together(_for_next(diagnosis, args.out))
     if args.write_urdf:
         text = with_dynamics(model, diagnosis.corrected_xml, _without_place(diagnosis.summary))
         write_whole(os.path.join(args.out, "corrected.urdf"), text)
         files = [*files, "corrected.urdf"]
     return diagnosis, files
+
+
+def _for_next(diagnosis, out):
+    """{path: text} of what --next needs beside the report: the model as it was read, and what the
+    recordings reached."""
+    world = diagnosis.world
+    reached = reached_by(diagnosis.train + diagnosis.held_out, world.model)
+    return {
+        os.path.join(out, "nominal.xml"): writer.portable(world.corrected_xml({})[0], out),
+        os.path.join(out, "recorded.json"): json.dumps(reached, indent=1) + "\n",
+    }
 
 
 def _without_place(summary):
@@ -310,7 +345,11 @@ def main(argv=None):
         bar.update(max(0, min(1, fraction) - bar.n))
 
     try:
-        args = _parser().parse_args(argv)
+        args = _checked(_parser().parse_args(argv))
+        if args.next:
+            with quiet():
+                print(write_next(args.next, args.seconds))
+            return 0
         with quiet():
             if sys.stderr.isatty():
                 bar = tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", file=sys.stderr)

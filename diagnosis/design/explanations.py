@@ -1,0 +1,182 @@
+"""What a finished report left open, as settings of its nominal model that can be simulated.
+
+left = Open.read("report/")
+left.settings[0]        # all findings; the others: with one finding exchanged for a rival
+"""
+
+import json
+import os
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from diagnosis.nominal.model import ModelError, load_world
+from diagnosis.recordings.columns import WIDTHS, columns_of
+from diagnosis.simulation.simulator import World
+
+STILL = 5.0  # noises: a joint that moved less never moved
+BEYOND = 0.25  # of the recorded range, by which a joint without limits may leave it
+SLACK = 0.02  # of a range, kept free at its ends
+DEFAULT_NOISE = 1e-3  # rad or m, where the report has none
+RUBBING = "coulomb_friction", "viscous_damping", "armature"  # asked of a joint that never moved
+
+
+class DesignError(ValueError):
+    """No excitation can be designed. One line: why, and what to do."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an excitation may do. low, high, speed (n,): of hinges and slides; control_low,
+    control_high (nu,): of the controls; period: s between rows."""
+
+    low: np.ndarray
+    high: np.ndarray
+    speed: np.ndarray
+    control_low: np.ndarray
+    control_high: np.ndarray
+    period: float
+
+
+@dataclass(frozen=True)
+class Open:
+    """What a report left open.
+
+    world: the nominal model. names, settings: explanations, the first being the report's own.
+    free: [Candidate] that only motion not recorded yet would show, at their nominal values.
+    noise (n,): of hinges and slides. limits: what was reached, and what the model allows.
+    """
+
+    world: World
+    names: tuple
+    settings: tuple
+    free: tuple
+    noise: np.ndarray
+    limits: Limits
+
+    @classmethod
+    def read(cls, folder: str) -> "Open":
+        """From a report's folder. Raises DesignError."""
+        summary = _json(os.path.join(folder, "diagnosis.json"), "findings")
+        reached = _json(os.path.join(folder, "recorded.json"), "columns")
+        path = os.path.join(folder, "nominal.xml")
+        if not os.path.isfile(path):
+            raise DesignError(
+                f"{path}: no such file; diagnose again, it is written beside the report"
+            )
+        try:
+            world = load_world(path)
+        except ModelError as error:
+            raise DesignError(error) from None
+        names, settings = _explanations(world, summary)
+        joints = single(world.model)
+        known = summary.get("noise") or {}
+        noise = np.array([known.get(f"qpos:{j}") or DEFAULT_NOISE for j in joints])
+        still = [j for j, n in zip(joints, noise) if _range(reached, f"qpos:{j}") < STILL * n]
+        free = tuple(
+            c for c in world.candidates if c.effect.name in RUBBING and c.place.name in still
+        )
+        return cls(world, names, settings, free, noise, limits_of(world.model, reached))
+
+
+def single(model: mujoco.MjModel) -> list[str]:
+    """Names of the hinges and slides, in MuJoCo's order."""
+    return [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] not in WIDTHS]
+
+
+def reached_by(recordings, model: mujoco.MjModel) -> dict:
+    """What recordings reached, for recorded.json: {"columns": {name: [low, high]}, "speeds":
+    {joint: largest}, "period": s}."""
+    columns, speeds = {}, {}
+    for column, (kind, k) in columns_of(model).items():
+        if kind in ("qpos", "ctrl"):
+            values = np.concatenate([getattr(r, kind)[:, k] for r in recordings])
+            if np.isfinite(values).any():
+                columns[column] = [float(np.nanmin(values)), float(np.nanmax(values))]
+    for joint in single(model):
+        q = model.jnt_qposadr[model.joint(joint).id]
+        rates = []
+        for r in recordings:
+            known = np.isfinite(r.qpos[:, q])
+            rates.append(np.abs(np.diff(r.qpos[known, q]) / np.diff(r.time[known])))
+        rates = np.concatenate(rates)
+        if len(rates):
+            speeds[joint] = float(np.quantile(rates, 0.995))
+    period = float(np.median(np.concatenate([np.diff(r.time) for r in recordings])))
+    return {"columns": columns, "speeds": speeds, "period": period}
+
+
+def limits_of(model: mujoco.MjModel, reached: dict) -> Limits:
+    """The Limits of a model whose recordings reached {"columns", "speeds", "period"}."""
+    low, high, speed = [], [], []
+    for joint in single(model):
+        j = model.joint(joint).id
+        first, last = reached["columns"].get(f"qpos:{joint}", (0.0, 0.0))
+        more = BEYOND * (last - first)
+        span = model.jnt_range[j] if model.jnt_limited[j] else (first - more, last + more)
+        low.append(span[0] + SLACK * (span[1] - span[0]))
+        high.append(span[1] - SLACK * (span[1] - span[0]))
+        usual = max(reached["speeds"].values(), default=1.0)
+        speed.append(max(reached["speeds"].get(joint, 0.0), 0.2 * usual) * (1 + BEYOND))
+    span = model.actuator_ctrlrange.copy()
+    for name, (kind, k) in columns_of(model).items():
+        if kind == "ctrl" and not model.actuator_ctrllimited[k]:
+            span[k] = reached["columns"].get(name, (0.0, 0.0))
+    every = (np.array(values, dtype=float) for values in (low, high, speed))
+    return Limits(*every, span[:, 0], span[:, 1], reached["period"])
+
+
+def _json(path, key):
+    """The content of a report's file. Raises DesignError."""
+    try:
+        with open(path, encoding="utf-8") as stream:
+            content = json.load(stream)
+        if key not in content:
+            raise ValueError
+        return content
+    except OSError as error:
+        raise DesignError(
+            f"{path}: cannot be read ({error.strerror}); give the folder of a finished report"
+        ) from None
+    except (ValueError, TypeError):
+        raise DesignError(f"{path}: is not of a report; diagnose again") from None
+
+
+def _range(reached, column):
+    low, high = reached["columns"].get(column, (0.0, 0.0))
+    return high - low
+
+
+def _explanations(world, summary):
+    """(names, settings): all findings that can be simulated, then with one exchanged for each of
+    its rivals."""
+    found = [(f, _setting(world, f)) for f in summary["findings"]]
+    base = {c: values for _, pair in found if pair for c, values in [pair]}
+    names, settings = ["as diagnosed"], [base]
+    for finding, pair in found:
+        for rival in finding.get("also_possible") or []:
+            other = _setting(world, rival)
+            if pair and other and other[0] not in base:
+                settings.append({c: v for c, v in base.items() if c != pair[0]} | dict([other]))
+                names.append(f"{_words(rival)} instead of {_words(finding)}")
+    return tuple(names), tuple(settings)
+
+
+def _setting(world, finding):
+    """(Candidate, values) of a finding or a rival, or None where it cannot be simulated from
+    here."""
+    if finding.get("when") or finding["effect"] == "unknown":
+        return None
+    try:
+        candidate = world.candidate(finding["effect"], finding["place"]["name"])
+    except KeyError:
+        return None
+    told = {p["name"]: p["value"] for p in finding["parameters"]}
+    values = [told.get(p.name) for p in candidate.parameters]
+    nominal = [p.nominal for p in candidate.parameters]
+    return candidate, tuple(float(n if v is None else v) for v, n in zip(values, nominal))
+
+
+def _words(finding):
+    return f"{finding['effect']} at {finding['place']['name']}"
