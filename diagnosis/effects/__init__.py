@@ -8,8 +8,25 @@ A new effect is one class in one of these modules; the decorator `catalogue` add
 # Effects join the catalogue in the order of these imports.
 # isort: off
 from diagnosis.effects.base import EFFECTS
-from diagnosis.effects import joints, actuators, drives, transmissions, environment, bodies
+from diagnosis.effects import (
+    joints,
+    actuators,
+    drives,
+    friction,
+    transmissions,
+    environment,
+    bodies,
+)
 
 # isort: on
 
-__all__ = ["EFFECTS", "actuators", "bodies", "drives", "environment", "joints", "transmissions"]
+__all__ = [
+    "EFFECTS",
+    "actuators",
+    "bodies",
+    "drives",
+    "environment",
+    "friction",
+    "joints",
+    "transmissions",
+]

@@ -14,7 +14,6 @@ from diagnosis.effects.base import (
     SLIDE,
     Effect,
     Parameter,
-    Part,
     catalogue,
     end_of_step,
     runge_kutta,
@@ -76,48 +75,6 @@ class ActuatorEffect(Effect):
         actuator.type = mujoco.mjtActuator.mjACTUATOR_GENERAL
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         return actuator
-
-
-def actuator_force(models, a):
-    """Function (qpos (S,nq), qvel (S,nv), ctrl (S,nu)) -> (S,) force of actuator a on a joint.
-
-    clip((g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇) to its range, l the length gear · q.
-    """
-    model = models[0]
-    joint, u = model.actuator_trnid[a, 0], model.actuator_ctrladr[a]
-    q, d, gear = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.actuator_gear[a, 0]
-    gain, bias = (
-        np.array([getattr(m, f"actuator_{f}prm")[a, :3] for m in models]).T
-        for f in ("gain", "bias")
-    )
-    gain[1:] *= model.actuator_gaintype[a] == int(mujoco.mjtGain.mjGAIN_AFFINE)
-    bias *= model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    free = -np.inf, np.inf
-    low, high = np.array(
-        [m.actuator_forcerange[a] if m.actuator_forcelimited[a] else free for m in models]
-    ).T
-
-    def force(qpos, qvel, ctrl):
-        at = np.stack([np.ones(len(qpos)), gear * qpos[:, q], gear * qvel[:, d]])
-        return np.clip((gain * at).sum(axis=0) * ctrl[:, u] + (bias * at).sum(axis=0), low, high)
-
-    return force
-
-
-def lost(models, a, change):
-    """Function as of Effect.force: what change(force, speed, time) adds to the force of actuator a.
-
-    force, speed (S,) of the actuator; the result acts on its joint.
-    """
-    model, force = models[0], actuator_force(models, a)
-    d, gear = model.jnt_dofadr[model.actuator_trnid[a, 0]], model.actuator_gear[a, 0]
-
-    def function(qpos, qvel, ctrl, time):
-        out = np.zeros_like(qvel)
-        out[:, d] = gear * change(force(qpos, qvel, ctrl), gear * qvel[:, d], time)
-        return out
-
-    return function
 
 
 def refine(spec, longest):
@@ -351,8 +308,8 @@ class Delay(ActuatorEffect):
         return replace(signal, delay=values[0])
 
     def write(self, spec, model, i, values):
-        """MuJoCo reads its history as of each force evaluation, but only what was there before
-        the step."""
+        """MuJoCo reads its history as of each force evaluation, but only what was there before the
+        step."""
         seconds, actuator, step = (
             values[0],
             spec.actuator(model.actuator(i).name),
@@ -381,63 +338,3 @@ def nominal_delay(model, i):
     """Seconds by which the nominal model delays actuator i: MuJoCo rounds a part of a step up to
     one."""
     return max(model.actuator_delay[i], model.opt.timestep) if model.actuator_delay[i] > 0 else 0.0
-
-
-@catalogue
-class DeadZone(ActuatorEffect):
-    """Nothing happens below a threshold: of the control (motor) or of the force (servo)."""
-
-    name, simplicity, amplitudes, related = "dead_zone", 2, 1, ("coulomb_friction", "gain")
-    acts_through = "control"
-
-    def fits(self, model, i):
-        motor = model.actuator_gainprm[i, 0] and not self._servo(model, i)
-        return super().fits(model, i) and (
-            motor
-            or self.on_joint(model, i)
-            and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
-        )
-
-    @staticmethod
-    def _servo(model, i):
-        return model.actuator_biasprm[i, 1:3].any()
-
-    def parameters(self, model, i):
-        F = self.strength(model, i)
-        if self._servo(model, i):
-            return (Parameter("half_width", self.unit(model, i), 0.0, 0.0, HUGE * F, 0.005 * F),)
-        u = F / abs(model.actuator_gainprm[i, 0])
-        return (Parameter("half_width", "control", 0.0, 0.0, HUGE * u, 0.01 * u),)
-
-    def probes(self, model, i, recordings):
-        used = np.quantile(self.forces(model, i, recordings), 0.9)
-        unit = 1.0 if self._servo(model, i) else abs(model.actuator_gainprm[i, 0])
-        return used / unit * np.array([[0.03], [0.1], [0.3]]) if used > 0 else np.zeros((0, 1))
-
-    def command(self, signal, model, i, values):
-        if self._servo(model, i):
-            return signal
-        return replace(
-            signal, value=np.sign(signal.value) * np.maximum(abs(signal.value) - values[0], 0.0)
-        )
-
-    def stepwise(self, model, i):
-        return bool(self._servo(model, i))
-
-    def force(self, models, i, values):
-        model = models[0]
-        if not self._servo(model, i):
-            return None
-
-        def absorbed(force, qvel, time):
-            return -np.clip(force, -values[:, 0], values[:, 0])
-
-        return lost(models, i, absorbed)
-
-    def write(self, spec, model, i, values):
-        """No actuator of MJCF has one: see part()."""
-        return "python"
-
-    def part(self, model, i, values):
-        law = "dead_zone_of_force" if self._servo(model, i) else "dead_zone"
-        return Part(law, model.actuator(i).name, {"half_width": float(values[0])})

@@ -1,7 +1,7 @@
 """What an effect is: a place, parameters, and the ways it can change a simulation.
 
-An effect acts in one or more ways, each a method of Effect that does nothing
-unless a class overrides it:
+An effect acts in one or more ways, each a method of Effect that does nothing unless a class
+overrides it:
 
     edit      fields of the compiled model         build    parts edit() sizes
     command   the control on its way               push     a constant force
@@ -10,8 +10,8 @@ unless a class overrides it:
     write     the same in MJCF                     far      values to try at full size
     suited    steps for the motion recorded
 
-Values are absolute, in SI units, with the sign of the MJCF field. A new effect
-is one class with the decorator @catalogue, and no other line.
+Values are absolute, in SI units, with the sign of the MJCF field. A new effect is one class with
+the decorator @catalogue, and no other line.
 """
 
 from dataclasses import dataclass
@@ -46,9 +46,8 @@ class Place:
 class Parameter:
     """One number of an effect.
 
-    `step` is a small typical change, for sensitivities; values outside
-    [low, high] are not physical. nominal is infinite for a limit that the
-    nominal model does not have.
+    `step` is a small typical change, for sensitivities; values outside [low, high] are not
+    physical. nominal is infinite for a limit that the nominal model does not have.
     """
 
     name: str
@@ -146,8 +145,8 @@ class Effect:
         raise NotImplementedError
 
     def probes(self, model, i, recordings):
-        """Values (P, parameters) to try first: by default each parameter a step up, and down
-        where it may."""
+        """Values (P, parameters) to try first: by default each parameter a step up, and down where
+        it may."""
         parameters = self.parameters(model, i)
         nominal = [p.nominal for p in parameters]
         rows = [
@@ -212,13 +211,12 @@ class Effect:
         return None
 
     def limit(self, models, i, values):
-        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,), qfrc_bias
-        (S,nv)) -> (S,nv), at least 0.
+        """None, or a function (qpos (S,nq), qvel (S,nv), ctrl (S,nu), time (S,), qfrc_bias (S,nv))
+        -> (S,nv), at least 0.
 
         By so much the dry friction that a joint can hold, its frictionloss, is larger. The
-        arguments are those of force();
-        qfrc_bias is MuJoCo's: Coriolis forces minus gravity, so that -qfrc_bias is the load from
-        outside, but for contacts.
+        arguments are those of force(); qfrc_bias is MuJoCo's: Coriolis forces minus gravity, so
+        that -qfrc_bias is the load from outside, but for contacts.
         """
         return None
 
@@ -324,8 +322,8 @@ def displace(spec, kind, name, by):
 
 
 def explicit_inertia(spec, model):
-    """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot
-    be edited."""
+    """Make every inertia of spec explicit, as compiled: what geoms or a total mass imply cannot be
+    edited."""
     compiler, on = spec.compiler, mujoco.mjtInertiaFromGeom
     # even over what the file says
     implied = compiler.inertiafromgeom == on.mjINERTIAFROMGEOM_TRUE or compiler.settotalmass > 0

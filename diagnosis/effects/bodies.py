@@ -251,8 +251,8 @@ class SensorEffect(Effect):
         return self.kind == "sensor" or model.jnt_type[i] in (HINGE, SLIDE)
 
     def stops(self, model, i, recordings):
-        """[(reading, end of the range)] where the joint seems to lie at its stop: there a
-        sensor's fault shows at once."""
+        """[(reading, end of the range)] where the joint seems to lie at its stop: there a sensor's
+        fault shows at once."""
         limited = self.kind == "joint" and model.jnt_limited[i]
         position = JointEffect.travel(model, i, recordings)[0] if limited else ()
         if not len(position):
@@ -289,8 +289,8 @@ class SensorBias(SensorEffect):
 
     @staticmethod
     def shared(model, i):
-        """Whether what reads the joint too would see its zero move: a fixed tendon, an actuator
-        in the parent's frame, a muscle."""
+        """Whether what reads the joint too would see its zero move: a fixed tendon, an actuator in
+        the parent's frame, a muscle."""
         wrapped = (model.wrap_objid == i) & (model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT)
         gain, bias = mujoco.mjtGain, mujoco.mjtBias
         plain = (

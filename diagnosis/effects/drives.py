@@ -1,8 +1,7 @@
-"""Physics of real drives: gears whose friction follows their load, bearings that run out of true.
+"""What a drive cannot give: dead zones, limits of rate and speed, a strength that falls.
 
-Their dry friction depends on the state, so a simulation sets it anew before each step (see
-Effect.limit),
-and beside corrected.xml a script does the same (corrected.py).
+The forces depend on the state: a simulation works them out before each step (see Effect.force),
+and beside corrected.xml a script does (corrected.py).
 """
 
 from dataclasses import replace
@@ -10,26 +9,51 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from diagnosis.effects.actuators import ActuatorEffect, actuator_force, lost
-from diagnosis.effects.base import (
-    HUGE,
-    JOINT_TRANSMISSION,
-    Candidate,
-    Parameter,
-    Part,
-    Place,
-    catalogue,
-)
-from diagnosis.effects.joints import (
-    DISSIPATION,
-    SOLIMP_FRICTION,
-    SOLREF_FRICTION,
-    JointEffect,
-)
+from diagnosis.effects.actuators import ActuatorEffect
+from diagnosis.effects.base import HUGE, JOINT_TRANSMISSION, Parameter, Part, catalogue
+from diagnosis.effects.joints import JointEffect
 
-SELF_LOCKING = 2.0  # share of the load beyond which no drive would turn
-CYCLES = 1.0, 2.0, 3.0  # of a friction map over the travel, to try first
-PHASES = 0.0, np.pi / 2, np.pi, 1.5 * np.pi
+
+def actuator_force(models, a):
+    """Function (qpos (S,nq), qvel (S,nv), ctrl (S,nu)) -> (S,) force of actuator a on a joint.
+
+    clip((g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇) to its range, l the length gear · q.
+    """
+    model = models[0]
+    joint, u = model.actuator_trnid[a, 0], model.actuator_ctrladr[a]
+    q, d, gear = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.actuator_gear[a, 0]
+    gain, bias = (
+        np.array([getattr(m, f"actuator_{f}prm")[a, :3] for m in models]).T
+        for f in ("gain", "bias")
+    )
+    gain[1:] *= model.actuator_gaintype[a] == int(mujoco.mjtGain.mjGAIN_AFFINE)
+    bias *= model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    free = -np.inf, np.inf
+    low, high = np.array(
+        [m.actuator_forcerange[a] if m.actuator_forcelimited[a] else free for m in models]
+    ).T
+
+    def force(qpos, qvel, ctrl):
+        at = np.stack([np.ones(len(qpos)), gear * qpos[:, q], gear * qvel[:, d]])
+        return np.clip((gain * at).sum(axis=0) * ctrl[:, u] + (bias * at).sum(axis=0), low, high)
+
+    return force
+
+
+def lost(models, a, change):
+    """Function as of Effect.force: what change(force, speed, time) adds to the force of actuator a.
+
+    force, speed (S,) of the actuator; the result acts on its joint.
+    """
+    model, force = models[0], actuator_force(models, a)
+    d, gear = model.jnt_dofadr[model.actuator_trnid[a, 0]], model.actuator_gear[a, 0]
+
+    def function(qpos, qvel, ctrl, time):
+        out = np.zeros_like(qvel)
+        out[:, d] = gear * change(force(qpos, qvel, ctrl), gear * qvel[:, d], time)
+        return out
+
+    return function
 
 
 def drives_of(model, j):
@@ -63,189 +87,64 @@ def drive_torque(models, j):
     return torque
 
 
-class DryFriction(JointEffect):
-    """Dry friction of a level that depends on the state: |F| ≤ level, added to the joint's
-    frictionloss."""
-
-    law = ""  # in corrected.py
-    acts_through, simplicity, related = "velocity", 3, ("coulomb_friction", *DISSIPATION, "gain")
-
-    def edit(self, model, i, values):
-        d = model.jnt_dofadr[i]
-        if not model.dof_frictionloss[d]:  # as CoulombFriction does: a stuck joint must not creep
-            model.dof_solref[d], model.dof_solimp[d] = SOLREF_FRICTION, SOLIMP_FRICTION
-
-    def write(self, spec, model, i, values):
-        joint = spec.joint(model.joint(i).name)
-        if not joint.frictionloss:
-            joint.solref_friction, joint.solimp_friction = SOLREF_FRICTION, SOLIMP_FRICTION
-        return "python"
-
-    def level(self, models, i, values):
-        """Function (qpos, qvel, ctrl, time, qfrc_bias) -> (S,), the level in the joint."""
-        raise NotImplementedError
-
-    def part(self, model, i, values):
-        numbers = {p.name: float(v) for p, v in zip(self.parameters(model, i), values)}
-        return Part(self.law, model.joint(i).name, numbers)
-
-    def limit(self, models, i, values):
-        d, level = models[0].jnt_dofadr[i], self.level(models, i, values)
-
-        def limit(qpos, qvel, ctrl, time, qfrc_bias):
-            out = np.zeros_like(qvel)
-            out[:, d] = level(qpos, qvel, ctrl, time, qfrc_bias)
-            return out
-
-        return limit
-
-
 @catalogue
-class LoadFriction(DryFriction):
-    """Gear teeth pressed together by what they carry: |F| ≤ share · |τ_drive − external · τ_load|.
+class DeadZone(ActuatorEffect):
+    """Nothing happens below a threshold: of the control (motor) or of the force (servo)."""
 
-    τ_drive is the force of the joint's drives, τ_load what pulls on it from outside (gravity and
-    Coriolis forces,
-    −qfrc_bias; contacts are not counted), both in N·m (N in a slide) of the joint; they press
-    from both sides where
-    they oppose each other. share is `driving` where the drive moves the joint (τ_drive · v ≥ 0),
-    `driven` where the
-    load does. external 1 is a train of gears between two loads, 0 counts the drive's side alone.
-    All are ratios.
-    With both shares equal and a constant load it is `coulomb_friction`; driving alone, without a
-    load from outside, is
-    in motion a smaller `gain`. Sources: Duclusaud, Passault, Padois, Daniel: Extended Friction
-    Models for the Physics
-    Simulation of Servo Actuators (2024), models M4 to M6; efficiency forward and backward of
-    gears: Linderoth,
-    Stolt, Robertsson, Johansson (2013).
-    """
-
-    name, law, amplitudes = "load_friction", "load_friction", 2
+    name, simplicity, amplitudes, related = "dead_zone", 2, 1, ("coulomb_friction", "gain")
+    acts_through = "control"
 
     def fits(self, model, i):
-        return super().fits(model, i) and bool(drives_of(model, i))
+        motor = model.actuator_gainprm[i, 0] and not self._servo(model, i)
+        return super().fits(model, i) and (
+            motor
+            or self.on_joint(model, i)
+            and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
+        )
+
+    @staticmethod
+    def _servo(model, i):
+        return model.actuator_biasprm[i, 1:3].any()
 
     def parameters(self, model, i):
-        return (
-            Parameter("driving", "1", 0.0, 0.0, SELF_LOCKING, 0.02),
-            Parameter("driven", "1", 0.0, 0.0, SELF_LOCKING, 0.02),
-            Parameter("external", "1", 1.0, 0.0, 1.0, -0.1),
-        )
+        F = self.strength(model, i)
+        if self._servo(model, i):
+            return (Parameter("half_width", self.unit(model, i), 0.0, 0.0, HUGE * F, 0.005 * F),)
+        u = F / abs(model.actuator_gainprm[i, 0])
+        return (Parameter("half_width", "control", 0.0, 0.0, HUGE * u, 0.01 * u),)
 
     def probes(self, model, i, recordings):
-        shares = ((0.2, 0.2), (0.2, 0.0), (0.0, 0.2))
-        return np.array([(*share, external) for share in shares for external in (1.0, 0.0)])
+        used = np.quantile(self.forces(model, i, recordings), 0.9)
+        unit = 1.0 if self._servo(model, i) else abs(model.actuator_gainprm[i, 0])
+        return used / unit * np.array([[0.03], [0.1], [0.3]]) if used > 0 else np.zeros((0, 1))
 
-    def possible(self, values, nominal):
-        return max(values[:2]) > 0
-
-    def level(self, models, i, values):
-        d, torque = models[0].jnt_dofadr[i], drive_torque(models, i)
-        driving, driven, external = values.T
-
-        def level(qpos, qvel, ctrl, time, qfrc_bias):
-            drive = torque(qpos, qvel, ctrl)
-            share = np.where(drive * qvel[:, d] >= 0, driving, driven)
-            return share * abs(drive + external * qfrc_bias[:, d])
-
-        return level
-
-
-@catalogue
-class FrictionMap(DryFriction):
-    """Coulomb friction that comes and goes along the travel: |F| ≤ level · (1 + contrast ·
-    sin(waves·q + phase)).
-
-    level in N·m (N), contrast 0 to 1, waves per rad (m) of the joint, phase in rad: a bearing or
-    rail out of true.
-    Without contrast it is `coulomb_friction`. Of any other shape: see FrictionCurve.
-    """
-
-    name, law, amplitudes, loaded = "friction_map", "friction_wave", 1, False
-
-    def parameters(self, model, i):
-        M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
-        return (
-            Parameter("level", force, 0.0, 0.0, HUGE * M, 0.05 * M),
-            Parameter("contrast", "1", 0.8, 0.0, 1.0, -0.1),
-            Parameter("waves", self.unit(model, i, "1", "rad/m"), 6.0, 0.1, 1e6, 0.1),
-            Parameter("phase", "rad", 0.0, -10.0, 10.0, 0.1),
+    def command(self, signal, model, i, values):
+        if self._servo(model, i):
+            return signal
+        return replace(
+            signal, value=np.sign(signal.value) * np.maximum(abs(signal.value) - values[0], 0.0)
         )
 
-    def suited(self, parameters, model, i, recordings):
-        """At least half a wave within the recorded travel."""
-        level, contrast, waves, phase = parameters
-        least = np.pi / self._travelled(model, i, recordings)
-        return level, contrast, replace(waves, low=min(max(waves.low, least), waves.high)), phase
+    def stepwise(self, model, i):
+        return bool(self._servo(model, i))
 
-    def _travelled(self, model, i, recordings):
-        position, _ = self.travel(model, i, recordings)
-        return np.ptp(np.quantile(position, [0.02, 0.98])) + 1e-6 if len(position) else 1.0
+    def force(self, models, i, values):
+        model = models[0]
+        if not self._servo(model, i):
+            return None
 
-    def probes(self, model, i, recordings):
-        level, travel = 0.1 * self.scale(model, i), self._travelled(model, i, recordings)
-        waves = [2 * np.pi * cycles / travel for cycles in CYCLES]
-        return np.array([(level, 0.8, n, phase) for n in waves for phase in PHASES])
+        def absorbed(force, qvel, time):
+            return -np.clip(force, -values[:, 0], values[:, 0])
 
-    def possible(self, values, nominal):
-        return values[0] > 0 and values[1] > 0.05
+        return lost(models, i, absorbed)
 
-    def canonical(self, values):
-        level, contrast, waves, phase = values
-        return level, contrast, waves, phase % (2 * np.pi)
-
-    def level(self, models, i, values):
-        q = models[0].jnt_qposadr[i]
-        level, contrast, waves, phase = values.T
-
-        def at(qpos, qvel, ctrl, time, qfrc_bias):
-            return level * (1 + contrast * np.sin(waves * qpos[:, q] + phase))
-
-        return at
-
-
-class FrictionCurve(DryFriction):
-    """Coulomb friction along the travel of any shape: its level at knots, linear between, flat
-    beyond. N·m or N.
-
-    As `unknown` it is made for its knots, by friction_curve(); it goes by the name of
-    FrictionMap, which has one shape.
-    """
-
-    name, kind, loaded = "friction_map", "joint", False
-
-    def __init__(self, knots):
-        self.knots = tuple(float(x) for x in knots)
-        if len(self.knots) < 2 or (np.diff(self.knots) <= 0).any():
-            raise ValueError("knots of a friction map: at least two positions that increase")
-
-    def __eq__(self, other):
-        return isinstance(other, FrictionCurve) and self.knots == other.knots
-
-    def __hash__(self):
-        return hash(self.knots)
-
-    def parameters(self, model, i):
-        M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
-        return tuple(
-            Parameter(f"level at {x:.3g}", force, 0.0, 0.0, HUGE * M, 0.05 * M) for x in self.knots
-        )
+    def write(self, spec, model, i, values):
+        """No actuator of MJCF has one: see part()."""
+        return "python"
 
     def part(self, model, i, values):
-        numbers = {"knots": list(self.knots), "levels": [float(v) for v in values]}
-        return Part("friction_curve", model.joint(i).name, numbers)
-
-    def level(self, models, i, values):
-        q, knots, rows = models[0].jnt_qposadr[i], np.array(self.knots), np.arange(len(values))
-
-        def at(qpos, qvel, ctrl, time, qfrc_bias):
-            x = qpos[:, q]
-            k = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
-            f = np.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0.0, 1.0)
-            return (1 - f) * values[rows, k] + f * values[rows, k + 1]
-
-        return at
+        law = "dead_zone_of_force" if self._servo(model, i) else "dead_zone"
+        return Part(law, model.actuator(i).name, {"half_width": float(values[0])})
 
 
 class DriveLimit(ActuatorEffect):
@@ -272,8 +171,8 @@ class DriveLimit(ActuatorEffect):
 class RateLimit(DriveLimit):
     """The control follows at a limited pace: |ẏ| ≤ rate, in units of the control per second.
 
-    A servo's goal that is ramped by its firmware, a valve that opens slowly. It starts at the first
-    control. Small steps pass as they are, unlike with a `lag`.
+    A servo's goal that is ramped by its firmware, a valve that opens slowly. It starts at the
+    first control. Small steps pass as they are, unlike with a `lag`.
     """
 
     name, law, simplicity, related = "rate_limit", "rate_limit", 2, ("lag", "delay", "gain")
@@ -340,8 +239,8 @@ class TorqueSpeed(DriveLimit):
 class GainFade(DriveLimit):
     """The drive weakens: τ exp(−rate · t), rate in 1/s, t the recording's time in s.
 
-    A battery that runs down, a motor that warms up and loses its magnets' strength. A drive that is
-    as weak from the beginning has another `gain`.
+    A battery that runs down, a motor that warms up and loses its magnets' strength. A drive that
+    is as weak from the beginning has another `gain`.
     """
 
     name, law, amplitudes, simplicity = "gain_fade", "gain_fade", 1, 2
@@ -359,8 +258,8 @@ class EffortFade(DriveLimit):
     """A motor weakens with what it has done: u exp(−per_effort · ∫ (u/u₀)² dt), per_effort in 1/s.
 
     u₀ is its largest control, so per_effort is the rate at full control: heat by its current, a
-    supply
-    that sags as it is drained. It has the name of GainFade, which falls whatever the motor does.
+    supply that sags as it is drained. It has the name of GainFade, which falls whatever the motor
+    does.
     """
 
     name, law, amplitudes, simplicity = "gain_fade", "effort_fade", 1, 3
@@ -382,10 +281,3 @@ class EffortFade(DriveLimit):
     def part(self, model, i, values):
         tires = float(values[0] / self._full(model, i) ** 2)
         return Part(self.law, model.actuator(i).name, {"tires": tires})
-
-
-def friction_curve(model, joint, knots):
-    """Candidate for a friction map of any shape in a joint: see FrictionCurve. Parameters: the
-    level at each knot."""
-    effect = FrictionCurve(knots)
-    return Candidate(effect, Place("joint", joint), effect.parameters(model, model.joint(joint).id))

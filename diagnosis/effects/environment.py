@@ -129,8 +129,8 @@ def touchable(model, i):
 class ContactEffect(Effect):
     """An effect on all contacts of one geom, which gets priority over its partners.
 
-    A pair's friction is the larger of the two and its solref a mixture, so the
-    geom first takes over what its pair has nominally.
+    A pair's friction is the larger of the two and its solref a mixture, so the geom first takes
+    over what its pair has nominally.
     """
 
     kinds, acts_through = ("geom",), "contact"

@@ -14,12 +14,10 @@ from diagnosis.effects.base import (
     SLIDE,
     Effect,
     Parameter,
-    angle,
     authored,
     catalogue,
     constant_force,
     passive,
-    runge_kutta,
     turns,
 )
 
@@ -31,9 +29,6 @@ STRENGTHS = (
     10.0,
     100.0,
 )  # of a force that grows faster than in proportion, over what turns the fastest motion round
-# share by which friction at rest is larger than that of motion, at least, that it is called
-# Stribeck's
-FALLS = 0.05
 DISSIPATION = ("viscous_damping", "coulomb_friction", "quadratic_damping", "back_emf")
 
 
@@ -244,86 +239,6 @@ class NonlinearStiffness(JointNumber):
 
 
 @catalogue
-class StribeckFriction(JointEffect):
-    """Dry friction that falls from `static` at rest to `coulomb` when moving faster than
-    `velocity`.
-
-    |F| = coulomb + (static − coulomb) exp(−(v/velocity)²): here as frictionloss `static` and
-    a force that gives back what it is too much once moving; in MJCF with LuGre bristles.
-    """
-
-    name, simplicity, related, amplitudes = "stribeck_friction", 3, DISSIPATION, 2
-    acts_through = "velocity"
-
-    def parameters(self, model, i):
-        M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
-        return (
-            Parameter("coulomb", force, 0.0, 0.0, HUGE * M, 0.05 * M),
-            Parameter("static", force, 0.0, 0.0, HUGE * M, 0.05 * M),
-            Parameter("velocity", self.unit(model, i, "rad/s", "m/s"), 0.1, 1e-4, 100.0, 0.01),
-        )
-
-    def suited(self, parameters, model, i, recordings):
-        """It has fallen at the speeds that are reached: what still falls there is another law of
-        friction."""
-        coulomb, static, velocity = parameters
-        _, speed = self.travel(model, i, recordings)
-        return (
-            coulomb,
-            static,
-            replace(
-                velocity,
-                high=max(
-                    velocity.nominal, np.quantile(speed, 0.5) + 1e-4, 0.5 * np.quantile(speed, 0.98)
-                ),
-            ),
-        )
-
-    def probes(self, model, i, recordings):
-        step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
-        slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
-        return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
-
-    def possible(self, values, nominal):
-        """It falls with speed, by enough to matter."""
-        return values[1] > (1 + FALLS) * values[0]
-
-    def edit(self, model, i, values):
-        CoulombFriction().edit(model, i, values[1:2])
-
-    def force(self, models, i, values):
-        d = models[0].jnt_dofadr[i]
-        coulomb, static, velocity = values.T
-
-        def released(qpos, qvel, ctrl, time):
-            v, out = qvel[:, d], np.zeros_like(qvel)
-            out[:, d] = (coulomb - static) * np.expm1(-((v / velocity) ** 2)) * np.sign(v)
-            return out
-
-        return released
-
-    def write(self, spec, model, i, values):
-        # bristles as stiff as the time step can carry
-        joint, h, (coulomb, static, velocity) = model.joint(i).name, spec.option.timestep, values
-        M = (
-            1 / model.dof_invweight0[model.jnt_dofadr[i]]
-        )  # what the joint feels, its neighbours free
-        if static == coulomb:
-            return CoulombFriction().write(spec, model, i, (coulomb,))
-        # they carry what falls off and a share of the rest, frictionloss what is left
-        share = (0.05 if runge_kutta(model) else 1e-3) * (static - coulomb)
-        share = min(share, coulomb) if share > 0 else coulomb
-        stiffness, damping = 0.1 * M / h**2, 0.0
-        if runge_kutta(model):  # also explodes where they relax within a step
-            stiffness = min(0.1 * stiffness, share / (h * max(3.0, 10 * velocity)))
-            damping = np.sqrt(stiffness * M)
-        CoulombFriction().write(spec, model, i, (coulomb - share,))
-        lugre = [stiffness, damping, share, static - coulomb + share, velocity]
-        passive(spec, f"stribeck_friction:{joint}", JOINT_TRANSMISSION, joint, lugre=lugre)
-        return "mjcf"
-
-
-@catalogue
 class SpringOffset(JointEffect):
     """A constant force in the joint: a spring at rest elsewhere, a tilt, a cable."""
 
@@ -462,61 +377,4 @@ class JointStop(JointEffect):
         joint = spec.joint(model.joint(i).name)
         joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
         joint.range = [authored(spec, model, i, x) for x in self._range(values)]
-        return "mjcf"
-
-
-@catalogue
-class Backlash(JointEffect):
-    """Play of width `gap` between motor and load; the sensor sits at the motor.
-
-    The recorded joint becomes the motor's; a second one in the same body, limited
-    to ± gap/2 and in the middle at the start of a run, carries the load. The motor side
-    needs inertia of its own: without armature it gets one per cent of the joint's.
-    """
-
-    name, simplicity, amplitudes = "backlash", 3, 1
-    acts_through = "position"
-
-    def fits(self, model, i):
-        body = model.jnt_bodyid[i]
-        last = model.body_jntadr[body] + model.body_jntnum[body] - 1 == i
-        return super().fits(model, i) and last and self.driven(model, i)
-
-    def parameters(self, model, i):
-        return (Parameter("gap", self.unit(model, i, "rad", "m"), 0.0, 0.0, 1.0, 0.005),)
-
-    def probes(self, model, i, recordings):
-        position, _ = self.travel(model, i, recordings)
-        return np.ptp(position) * np.array([[0.01], [0.04]])
-
-    def _load(self, model, i):
-        """Name of the joint that carries the load."""
-        return f"{self.name}:{model.joint(i).name}"
-
-    def build(self, spec, model, i):
-        motor = spec.joint(model.joint(i).name)
-        if motor.armature == model.dof_armature[model.jnt_dofadr[i]]:  # else another one was found
-            motor.armature = max(motor.armature, 0.01 * self.scale(model, i))
-        load = motor.parent.add_joint(
-            name=self._load(model, i),
-            type=motor.type,
-            pos=model.jnt_pos[i],
-            axis=model.jnt_axis[i],
-        )
-        load.armature = load.frictionloss = load.ref = load.springref = load.margin = 0.0
-        load.damping, load.stiffness = [0.0] * 3, [0.0] * 3
-        load.limited, load.range = (
-            mujoco.mjtLimited.mjLIMITED_TRUE,
-            [angle(spec, model, i, x) for x in (-0.5, 0.5)],
-        )
-        load.solref_limit, load.solimp_limit = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
-        return load
-
-    def edit(self, model, i, values):
-        model.jnt_range[model.joint(self._load(model, i)).id] = -values[0] / 2, values[0] / 2
-
-    def write(self, spec, model, i, values):
-        self.build(spec, model, i).range = [
-            angle(spec, model, i, x) for x in (-values[0] / 2, values[0] / 2)
-        ]
         return "mjcf"

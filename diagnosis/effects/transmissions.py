@@ -15,6 +15,7 @@ from diagnosis.effects.base import (
     JOINT_TRANSMISSION,
     SLIDE,
     Parameter,
+    angle,
     catalogue,
     joints_of,
     passive,
@@ -24,7 +25,6 @@ from diagnosis.effects.joints import (
     DISSIPATION,
     SOLIMP_FRICTION,
     SOLREF_FRICTION,
-    Backlash,
     JointEffect,
 )
 
@@ -42,16 +42,14 @@ DAMPED = 0.1  # its damping ratio
 
 @catalogue
 class Presliding(JointEffect):
-    """Dry friction whose contacts bend like bristles before they slip: F = −σ z, ż = v − σ |v| z
-    / F_c.
+    """Dry friction whose contacts bend like bristles before they slip: F = −σ z, ż = v − σ |v| z /
+    F_c.
 
     σ `stiffness` in N·m/rad (N/m), F_c `frictionloss` in N·m (N), in addition to the joint's own.
-    This is Dahl's model, and
-    LuGre's without micro damping and Stribeck's fall; with σ → ∞ it is `coulomb_friction`, for
-    motions below F_c/σ it is
-    `stiffness`. Sources: Dahl, A Solid Friction Model (1968); Canudas de Wit, Olsson, Åström,
-    Lischinsky (1995).
-    A window begins with the bristle as it is after the motion recorded before.
+    This is Dahl's model, and LuGre's without micro damping and Stribeck's fall; with σ → ∞ it is
+    `coulomb_friction`, for motions below F_c/σ it is `stiffness`. Sources: Dahl, A Solid Friction
+    Model (1968); Canudas de Wit, Olsson, Åström, Lischinsky (1995). A window begins with the
+    bristle as it is after the motion recorded before.
     """
 
     name, simplicity, amplitudes, related = (
@@ -123,16 +121,71 @@ class Presliding(JointEffect):
 
 
 @catalogue
+class Backlash(JointEffect):
+    """Play of width `gap` between motor and load; the sensor sits at the motor.
+
+    The recorded joint becomes the motor's; a second one in the same body, limited to ± gap/2 and
+    in the middle at the start of a run, carries the load. The motor side needs inertia of its own:
+    without armature it gets one per cent of the joint's.
+    """
+
+    name, simplicity, amplitudes = "backlash", 3, 1
+    acts_through = "position"
+
+    def fits(self, model, i):
+        body = model.jnt_bodyid[i]
+        last = model.body_jntadr[body] + model.body_jntnum[body] - 1 == i
+        return super().fits(model, i) and last and self.driven(model, i)
+
+    def parameters(self, model, i):
+        return (Parameter("gap", self.unit(model, i, "rad", "m"), 0.0, 0.0, 1.0, 0.005),)
+
+    def probes(self, model, i, recordings):
+        position, _ = self.travel(model, i, recordings)
+        return np.ptp(position) * np.array([[0.01], [0.04]])
+
+    def _load(self, model, i):
+        """Name of the joint that carries the load."""
+        return f"{self.name}:{model.joint(i).name}"
+
+    def build(self, spec, model, i):
+        motor = spec.joint(model.joint(i).name)
+        if motor.armature == model.dof_armature[model.jnt_dofadr[i]]:  # else another one was found
+            motor.armature = max(motor.armature, 0.01 * self.scale(model, i))
+        load = motor.parent.add_joint(
+            name=self._load(model, i),
+            type=motor.type,
+            pos=model.jnt_pos[i],
+            axis=model.jnt_axis[i],
+        )
+        load.armature = load.frictionloss = load.ref = load.springref = load.margin = 0.0
+        load.damping, load.stiffness = [0.0] * 3, [0.0] * 3
+        load.limited, load.range = (
+            mujoco.mjtLimited.mjLIMITED_TRUE,
+            [angle(spec, model, i, x) for x in (-0.5, 0.5)],
+        )
+        load.solref_limit, load.solimp_limit = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
+        return load
+
+    def edit(self, model, i, values):
+        model.jnt_range[model.joint(self._load(model, i)).id] = -values[0] / 2, values[0] / 2
+
+    def write(self, spec, model, i, values):
+        self.build(spec, model, i).range = [
+            angle(spec, model, i, x) for x in (-values[0] / 2, values[0] / 2)
+        ]
+        return "mjcf"
+
+
+@catalogue
 class JointElasticity(Backlash):
     """A spring and a damper between drive and link: J θ̈ = τ − F, F = k (θ − q) + c (θ̇ − q̇)
     moves the link.
 
-    k `stiffness` in N·m/rad (N/m), c `damping` in N·m·s/rad (N·s/m). The sensor sits at the
-    motor, as do the joint's
-    friction and armature J; without armature the motor gets one per cent of the joint's inertia.
-    At the tone's frequency
-    √(k/J') it is no `delay`: that turns no phase back. Source: Spong, Modeling and Control of
-    Elastic Joint Robots (1987).
+    k `stiffness` in N·m/rad (N/m), c `damping` in N·m·s/rad (N·s/m). The sensor sits at the motor,
+    as do the joint's friction and armature J; without armature the motor gets one per cent of the
+    joint's inertia. At the tone's frequency √(k/J') it is no `delay`: that turns no phase back.
+    Source: Spong, Modeling and Control of Elastic Joint Robots (1987).
     """
 
     name, simplicity, amplitudes, related = "joint_elasticity", 3, 0, ("delay", "lag", "backlash")
@@ -183,8 +236,8 @@ class JointElasticity(Backlash):
 
 
 class CoupledEffect(JointEffect):
-    """An effect in the sum of the positions of a joint and the one that carries it, named "a+b":
-    a fixed tendon."""
+    """An effect in the sum of the positions of a joint and the one that carries it, named "a+b": a
+    fixed tendon."""
 
     unit_names = "", ""
     number, field = "", ""
@@ -229,9 +282,8 @@ class CoupledFriction(CoupledEffect):
     q̇_b. N·m or N.
 
     As in differential wrists, linkages and belts that run through a joint. Beside
-    `coulomb_friction` of each joint, which
-    opposes its own speed. Source: MuJoCo's tendon frictionloss; Siciliano et al., Robotics
-    (2009), 5.4 on transmissions.
+    `coulomb_friction` of each joint, which opposes its own speed. Source: MuJoCo's tendon
+    frictionloss; Siciliano et al., Robotics (2009), 5.4 on transmissions.
     """
 
     name, number, field, acts_through = "coupled_friction", "level", "frictionloss", "velocity"

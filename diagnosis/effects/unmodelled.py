@@ -30,12 +30,9 @@ class Unknown(JointEffect):
     between, flat beyond.
 
     variable: 'position:<joint>', 'velocity:<joint>', 'control:<actuator>', 'load:<joint>' (the
-    force
-    of its drives) or 'time'. factor:
-    None, or what the curve is
-    multiplied by: 'control:<actuator>' for what it is asked for (see asked), or
-    'velocity:<joint>' for its sign. wave: a sine
-    through two knots, a quarter of its period apart.
+    force of its drives) or 'time'. factor: None, or what the curve is multiplied by:
+    'control:<actuator>' for what it is asked for (see asked), or 'velocity:<joint>' for its sign.
+    wave: a sine through two knots, a quarter of its period apart.
     """
 
     name, kind, simplicity = "unknown", "joint", 3
@@ -158,8 +155,8 @@ class UnknownSurface(JointEffect):
     """A force in the joint over two variables: its values on a grid of knots, bilinear, flat
     beyond.
 
-    variables: two, as of Unknown. knots: the grid's lines, (m,) and (n,). Parameters: m·n forces in
-    N·m (N), those of the first line first.
+    variables: two, as of Unknown. knots: the grid's lines, (m,) and (n,). Parameters: m·n forces
+    in N·m (N), those of the first line first.
     """
 
     name, kind, simplicity = "unknown", "joint", 3

@@ -40,11 +40,10 @@ class Signal:
         """What the actuator sees in each of `count` steps of `step` seconds from time `start`,
         (count,).
 
-        A row that changes inside a step counts by its share of it, so the result is
-        continuous in the delay, and what MuJoCo's linear interpolation gives. With a
-        lag: the value at the end of the step (MuJoCo's actearly) of the filter that is as
-        late on average (see end_of_step), or the filter's mean over the step if `average`
-        (a Runge-Kutta step sees the filter move).
+        A row that changes inside a step counts by its share of it, so the result is continuous in
+        the delay, and what MuJoCo's linear interpolation gives. With a lag: the value at the end
+        of the step (MuJoCo's actearly) of the filter that is as late on average (see end_of_step),
+        or the filter's mean over the step if `average` (a Runge-Kutta step sees the filter move).
         """
         if np.isfinite(self.rate):
             return self._followed(start, step, count, average)

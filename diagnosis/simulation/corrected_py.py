@@ -43,8 +43,7 @@ def python_parts(model, setting, written=None):
     """The Parts of a setting {Candidate: values} for corrected.py, in the order of the catalogue.
 
     model: the nominal MjModel. written: where each effect is held, as World.corrected_xml told;
-    without
-    it every effect with a part counts. What acts under a condition has no part.
+    without it every effect with a part counts. What acts under a condition has no part.
     """
     order = {effect: k for k, effect in enumerate(EFFECTS)}
     parts = []
@@ -148,12 +147,11 @@ np.savez(sys.argv[3], **out)
 
 
 def predictions(script, windows, model):
-    """What a corrected.py predicts in Windows, [(rows, nq)], worked out by importing it in
-    another process.
+    """What a corrected.py predicts in Windows, [(rows, nq)], worked out by importing it in another
+    process.
 
     model: the nominal MjModel, whose coordinates the recordings have. Velocities that were not
-    measured
-    are differences of the rows around. Raises ScriptError.
+    measured are differences of the rows around. Raises ScriptError.
     """
     recordings = list(dict.fromkeys(w.recording for w in windows))
     given = {"count": len(recordings)}
@@ -255,8 +253,7 @@ class CorrectedBatch(Batch):
     batch = CorrectedBatch(model, nsim=64, parts=parts_in(text))      # and then as any Batch
 
     Joints whose friction varies get a dof_frictionloss of each simulation's own. step() raises
-    ValueError for a force
-    over the control of an actuator with a delay or a filter.
+    ValueError for a force over the control of an actuator with a delay or a filter.
     """
 
     def __init__(self, model, nsim, nthread=0, parts=()):

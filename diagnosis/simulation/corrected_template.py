@@ -10,8 +10,8 @@
     install(model)                                        # or: in every mj_step, a viewer's too
 
 What is added stands in PARTS, in SI units; the laws are the functions below. A curve is linear
-between
-its knots and keeps its outermost value beyond them, so nothing grows outside what was recorded.
+between its knots and keeps its outermost value beyond them, so nothing grows outside what was
+recorded.
 """
 
 from pathlib import Path
@@ -307,9 +307,9 @@ def step(model, data, nstep=1):
 def install(model):
     """The same within every mj_step and mj_forward of this process, by MuJoCo's control callback.
 
-    At each evaluation of the forces, of which Runge-Kutta has four a step. The solver's rows of dry
-    friction are changed in place: there has to be one for each joint concerned, whose frictionloss
-    becomes at least 1e-9, and the solver must not split them into islands.
+    At each evaluation of the forces, of which Runge-Kutta has four a step. The solver's rows of
+    dry friction are changed in place: there has to be one for each joint concerned, whose
+    frictionloss becomes at least 1e-9, and the solver must not split them into islands.
     """
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
     for law, place, _ in PARTS:
@@ -341,8 +341,7 @@ def rollout(model, qpos, qvel, ctrl, time):
     """States (S, T, nq), (S, T, nv) of S runs from qpos (S, nq), qvel (S, nv) at time[0].
 
     ctrl (S, T, nu) is held from time[k] to time[k + 1]; time (T,) in s. Delays and lags begin at
-    rest
-    in the first control.
+    rest in the first control.
     """
     data, states = mujoco.MjData(model), []
     for q, v, u in zip(qpos, qvel, ctrl):
@@ -389,10 +388,8 @@ def predict(model, time, qpos, qvel, ctrl, windows, run_up=0.5):
     """[(rows, n)] positions of the recorded joints over windows [(first, last)] of one recording.
 
     time (T,), qpos (T, n), qvel (T, m), ctrl (T, nu) as recorded, columns of JOINTS and actuators
-    in order.
-    A window starts from its first row as recorded; what is not recorded (delays, lags, bristles,
-    added
-    joints) runs on from `run_up` seconds before.
+    in order. A window starts from its first row as recorded; what is not recorded (delays, lags,
+    bristles, added joints) runs on from `run_up` seconds before.
     """
     q, v = columns(model)
     data, out = mujoco.MjData(model), []

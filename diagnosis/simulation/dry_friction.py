@@ -1,8 +1,8 @@
 """Dry friction whose level depends on the state: each simulation's own frictionloss, set anew
 before each step.
 
-The constraint solver then sticks and slips as with a constant frictionloss; a force
-−level·sign(v) would chatter.
+The constraint solver then sticks and slips as with a constant frictionloss; a force −level·sign(v)
+would chatter.
 """
 
 from copy import copy
@@ -16,8 +16,8 @@ class VariableFriction:
     """The levels of simulations that share a working model.
 
     drives: (S,) Drives. groups: [(members, function)] as of Effect.limit. pool: clones, kept by
-    the caller.
-    models: the model each simulation runs on, a clone of its own where its friction varies.
+    the caller. models: the model each simulation runs on, a clone of its own where its friction
+    varies.
     """
 
     def __init__(self, drives, groups, nominal, pool):

@@ -99,8 +99,8 @@ class Working:
         return model
 
     def drive(self, items, recording, start, step, count, memo):
-        """The Drive under items for `count` steps from time `start`. memo keeps what the drives
-        of one call share."""
+        """The Drive under items for `count` steps from time `start`. memo keeps what the drives of
+        one call share."""
         key = id(items)
         if key not in memo:
             changed, qfrc, xfrc = {}, np.zeros(self.model.nv), np.zeros((self.model.nbody, 6))

@@ -11,10 +11,9 @@ FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 def read(model, q, v, time, step, delay):
     """qpos (n, rows, nq), qvel (n, rows, nv) at times (n, rows) after the first state; NaN where time is.
 
-    q (n, 1 + count, nq), v: the trajectory at every step. Between steps, positions follow
-    the cubic through positions and velocities, velocities the line, quaternions the
-    normalized line. delay (n, hinges and slides): these are read that much earlier,
-    but not before the first state.
+    q (n, 1 + count, nq), v: the trajectory at every step. Between steps, positions follow the
+    cubic through positions and velocities, velocities the line, quaternions the normalized line.
+    delay (n, hinges and slides): these are read that much earlier, but not before the first state.
     """
     missing = np.isnan(time)
     x = time / step

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from plants import PENDULUM, SIZES, START, arm, commanded, pendulum, record, simulate, stock
 
-from diagnosis.effects.drives import FrictionCurve, friction_curve
+from diagnosis.effects.friction import FrictionCurve, friction_curve
 from diagnosis.simulation.control_signal import Signal
 from diagnosis.simulation.simulator import Window, World
 

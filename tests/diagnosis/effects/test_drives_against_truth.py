@@ -1,9 +1,8 @@
 """Drives on a two-joint arm: the simulator against the trials' true system, which shares no code
 with it.
 
-Its laws are integrated by themselves at a tenth of the step; at the law's own values the effect
-of that
-name predicts its motion, and the nominal model does not.
+Its laws are integrated by themselves at a tenth of the step; at the law's own values the effect of
+that name predicts its motion, and the nominal model does not.
 """
 
 from dataclasses import replace

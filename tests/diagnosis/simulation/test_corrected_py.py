@@ -12,7 +12,7 @@ from mujoco.batch import Batch
 from plants import DT, SIZES, START, T, arm, commanded, pendulum, record, simulate
 
 from diagnosis.effects.base import Part
-from diagnosis.effects.drives import friction_curve
+from diagnosis.effects.friction import friction_curve
 from diagnosis.effects.unmodelled import surface
 from diagnosis.simulation.corrected_py import (
     CorrectedBatch,
