@@ -39,14 +39,14 @@ class Course:
 @dataclass(frozen=True)
 class Joint:
     """All courses of one joint, and what its force may depend on: {"velocity:elbow": (n,), ...},
-    of all courses in a row, with their units. depends_on: what the diagnosis says of that, if
-    anything."""
+    of all courses in a row, with their units. depends_on: what the diagnosis says of that; None
+    where it says nothing."""
 
     name: str
     courses: tuple
     variables: dict
     units: dict
-    depends_on: tuple = ()
+    depends_on: tuple | None = None
 
     @property
     def force(self) -> np.ndarray:
@@ -67,16 +67,19 @@ class Joint:
 
     @property
     def missing(self) -> bool:
-        """Whether there is more than chance would show; 5 % of noise lies outside its 95 %."""
-        return self.certain > MISSING
+        """Whether there is more than chance would show (5 % of noise lies outside its 95 %), and
+        it goes with something, where the diagnosis has looked for that."""
+        return self.certain > MISSING and self.depends_on != ()
 
     def best(self) -> tuple[str, float]:
-        """(variable, share of the variance that goes with it), of the one that the diagnosis names,
-        or else that explains most."""
-        named = [name for name in self.depends_on if name in self.variables]
-        if named:
-            return named[0], explained(self.variables[named[0]], self.force)
-        shares = {name: explained(x, self.force) for name, x in self.variables.items()}
+        """(variable, share of the variance that goes with it): of those that the diagnosis names,
+        or else of all, the one that explains most."""
+        named = [name for name in self.depends_on or () if name in self.variables]
+        shares = {
+            name: explained(x, self.force)
+            for name, x in self.variables.items()
+            if name in named or not named
+        }
         most = max(shares.values())
         return next((name, share) for name, share in shares.items() if share >= most - ALIKE)
 
@@ -138,8 +141,8 @@ def joints(diagnosis: Diagnosis) -> list[Joint]:
     found = []
     for name, some in grouped.items():
         entry = (told.get(name) if isinstance(told, dict) else None) or {}
-        asked = tuple(entry.get("depends_on") or ())
-        found.append(Joint(name, tuple(some), _variables(some, grouped), units, asked))
+        depends = tuple(entry["depends_on"]) if "depends_on" in entry else None
+        found.append(Joint(name, tuple(some), _variables(some, grouped), units, depends))
     return sorted(found, key=lambda joint: -joint.certain)
 
 

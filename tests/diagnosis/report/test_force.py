@@ -104,12 +104,24 @@ def test_the_page_begins_with_it(diagnosis):
     assert "Where the force is missing" not in sections.html_page(diagnosis)
 
 
-def test_the_variable_that_the_diagnosis_names_is_drawn():
+@pytest.mark.parametrize(
+    "named, drawn, missing",
+    [
+        (["position:a"], "position:a", True),
+        (["position:a", "velocity:a"], "velocity:a", True),
+        (["control:m"], "velocity:a", True),
+        ([], "velocity:a", False),
+        (None, "velocity:a", True),
+    ],
+)
+def test_of_what_the_diagnosis_names_the_most_telling_is_drawn(named, drawn, missing):
+    """A force of which it was found that it goes with nothing is folded away."""
     located = courses(lambda p, v, w, t: np.sign(v))
     located.located = located.summary["missing_force"]
-    located.summary["missing_force"] = {"a": {"depends_on": ["position:a"]}, "b": {}}
+    entry = {} if named is None else {"depends_on": named}
+    located.summary["missing_force"] = {"a": entry, "b": {"depends_on": []}}
     joint = force.joints(located)[0]
-    assert joint.best()[0] == "position:a"
+    assert joint.best()[0] == drawn and joint.missing == missing
 
 
 def test_each_joint_has_its_file(diagnosis, tmp_path):
