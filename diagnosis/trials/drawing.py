@@ -30,6 +30,7 @@ SHARES = (0.25, 0.33, 0.2, 0.14, 0.08)
 ATTEMPTS = 100
 MOST_NOISE = 4e-3  # rad
 TOUCHED = 0.02  # share of the time that a contact or a stop has to act, where one can
+FINEST = 5e-4  # s, of a nominal step
 AGREEMENT = 0.5  # noise: most that the nominal integrator may be away from the true one
 
 
@@ -229,7 +230,8 @@ def _agree(robot, plan, noise, rng):
     if run is None:
         raise Unfit
     for halvings in range(3 if may_touch(robot) else 2):
-        robot = replace(robot, step=robot.step / 2) if halvings else robot
+        if halvings and robot.step > FINEST:
+            robot = replace(robot, step=robot.step / 2)
         error = integration_error(robot, run, noise)
         if error <= AGREEMENT:
             return robot, plan
@@ -307,7 +309,7 @@ def _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target):
         if 0.6 * target < moved < 1.6 * target:
             break
         size = float(np.clip(size * np.clip(target / max(moved, 1e-9), 0.2, 6.0), 1e-3, 1.0))
-    if moved < 1.0:
+    if not 1.0 <= moved <= 4 * target:
         raise Unfit
     return size
 

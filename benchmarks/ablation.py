@@ -1,0 +1,135 @@
+"""Does each rule of the method earn its place? Every rule switched off, on the same drawn trials.
+
+    python benchmarks/ablation.py --cache devset --only 0-19 --out results/ablation.csv
+    python benchmarks/ablation.py diagnose FREE_CURVE --model sim.xml --recordings … --out report
+
+RULES holds, for each rule, the constants of the diagnosis that switch it off. The second line runs
+the diagnosis with one rule off, and is what the trials call. Rows that are done are kept beside
+the table, in OUT.rows/, so that a run that was stopped goes on.
+"""
+
+import argparse
+import importlib
+import json
+import math
+import os
+import pkgutil
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks import development  # noqa: E402
+from diagnosis.common.atomic_files import write_table  # noqa: E402
+
+WHOLE = "whole"  # the method as it is
+RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches it off}
+    WHOLE: {},
+}
+COLUMNS = (
+    "rule trials strict strict_whole lost won named named_whole false false_whole worse worse_whole "
+    "error seconds seconds_whole constants"
+).split()
+
+
+class UnknownConstant(ValueError):
+    """A constant that the diagnosis does not have: the list of rules is out of date."""
+
+
+def switch_off(constants):
+    """Set {"module:NAME": value} in the module and wherever it was imported from it by name."""
+    import diagnosis
+
+    for found in pkgutil.walk_packages(diagnosis.__path__, "diagnosis."):
+        if not found.name.startswith("diagnosis.trials") and "__main__" not in found.name:
+            importlib.import_module(found.name)
+    for address, value in constants.items():
+        module, _, name = address.partition(":")
+        if not hasattr(sys.modules.get(module), name):
+            raise UnknownConstant(f"{address}: there is no such constant; mend RULES")
+        before = getattr(sys.modules[module], name)
+        value = tuple(value) if isinstance(before, tuple) else value
+        for other in [m for k, m in sys.modules.items() if k.startswith("diagnosis.")]:
+            if getattr(other, name, None) is before:
+                setattr(other, name, value)
+
+
+def diagnose(words):
+    """Run the diagnosis's command line with one rule off; returns its exit status."""
+    from diagnosis.command import main as command
+
+    switch_off(RULES[words[0]])
+    return command(words[1:])
+
+
+def compare(rule, rows, whole):
+    """A row of the table: a rule's trials against the whole method's, paired by number."""
+    base = {int(row["trial"]): row for row in whole}
+    pairs = [(row, base[int(row["trial"])]) for row in rows if int(row["trial"]) in base]
+    total = lambda side, name: sum(float(pair[side][name] or 0) for pair in pairs)
+    named = lambda side: sum(p[side]["found"] == p[side]["needed"] for p in pairs)
+    worse = lambda side: sum(float(p[side]["prediction"] or 1) > 1.01 for p in pairs)
+    ratio = lambda p: float(p[0]["prediction"] or 1) / float(p[1]["prediction"] or 1)
+    count = max(len(pairs), 1)
+    return {
+        "rule": rule,
+        "trials": len(pairs),
+        "strict": int(total(0, "strict")),
+        "strict_whole": int(total(1, "strict")),
+        "lost": sum(int(a["strict"]) < int(b["strict"]) for a, b in pairs),
+        "won": sum(int(a["strict"]) > int(b["strict"]) for a, b in pairs),
+        "named": named(0),
+        "named_whole": named(1),
+        "false": int(total(0, "false")),
+        "false_whole": int(total(1, "false")),
+        "worse": worse(0),
+        "worse_whole": worse(1),
+        "error": f"{math.exp(sum(math.log(ratio(p)) for p in pairs) / count):.3f}",
+        "seconds": f"{total(0, 'seconds') / count:.1f}",
+        "seconds_whole": f"{total(1, 'seconds') / count:.1f}",
+        "constants": json.dumps(RULES[rule]),
+    }
+
+
+def parse():
+    """The options of development.py's score, and which rules."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cache", type=Path, required=True, help="drawn trials: development.py")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", help="numbers of trials: 3,8-12")
+    parser.add_argument("--kinds", default=",".join(development.KINDS))
+    parser.add_argument("--free", action="store_true", help="only trials that touch nothing")
+    parser.add_argument("--rules", help="some of RULES, by commas (all)")
+    parser.add_argument("--limit", type=int, default=300, help="processor seconds for a diagnosis")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    return parser.parse_args()
+
+
+def main():
+    """Score every rule's trials, write the table after each."""
+    options = parse()
+    os.environ["OMP_NUM_THREADS"] = "1"
+    names = [WHOLE, *(options.rules.split(",") if options.rules else list(RULES)[1:])]
+    unknown = sorted(set(names) - set(RULES))
+    if unknown:
+        sys.exit(f"{', '.join(unknown)}: no rule of that name; RULES has {', '.join(RULES)}")
+    table, out, options.keep = [], options.out, None
+    for name in names:
+        script = f"{{python}} {Path(__file__).resolve()} diagnose '{name}'"
+        options.tool = f"{script} --model {{model}} --recordings {{recordings}} --out {{out}}"
+        options.out = Path(f"{out}.rows") / f"{name.replace(' ', '_')}.csv"
+        print(name)
+        rows = development.score_all(options)
+        if name == WHOLE:
+            whole = rows
+        else:
+            table.append(compare(name, rows, whole))
+            write_table(out, COLUMNS, table)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["diagnose"]:
+        sys.exit(diagnose(sys.argv[2:]))
+    main()
