@@ -366,7 +366,8 @@ def test_a_terminal_that_cannot_show_a_sign(command):
             "types, json; "
             "s = json.load(open('report/diagnosis.json')); command.writer.write = lambda *a: "
             "['unknown_1.csv']; "
-            "command._for_next = lambda *a: {}; command.diagnose = lambda *a, **k: types.SimpleNamespace(summary=s); "
+            "command._for_next = lambda *a: {}; "
+            "command.diagnose = lambda *a, **k: types.SimpleNamespace(summary=s); "
             "sys.exit(command.main(['--model', 'sim.xml', '--recordings', 'run0.csv', '--out', "
             "'x']))",
             ROOT,
