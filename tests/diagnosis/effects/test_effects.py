@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from plants import MODELS, SIZES, START, T, arm, commanded, pendulum, record, simulate, stock
 
 from diagnosis.effects import EFFECTS
-from diagnosis.effects.unmodelled import asked
+from diagnosis.effects.unmodelled import asked, holds
 from diagnosis.simulation.corrected_py import python_parts
 from diagnosis.simulation.simulator import Case, Window, World
 
@@ -253,6 +253,7 @@ def test_unknown_curves():
             (-1.0, -0.3, 0.2, 0.6, 1.0),
         ),  # pushes away, the farther the more
         ((-1.0, 0.0, 0.3, 0.35, 1.0), (0.1, 0.1, 0.1, -0.2, -0.2)),  # a step between two knots
+        ((-0.88, -0.7, -0.33, 0.75), (-0.1, 0.6, -0.5, -0.9)),  # at its knots only
     ],
 )
 def test_a_polynomial_that_runs_away_is_not_written(knots, forces):
@@ -263,6 +264,21 @@ def test_a_polynomial_that_runs_away_is_not_written(knots, forces):
         assert world.corrected_xml({curve: forces})[1] == {curve: "python"}
     (part,) = python_parts(world.model, {curve: forces})
     assert part.numbers["knots"] == list(knots) and part.numbers["forces"] == list(forces)
+
+
+def test_a_polynomial_may_not_grow_beyond_its_knots():
+    """Half the travel further it is at most three times as large, and far away it pushes back."""
+    x = np.linspace(-1, 1, 41)
+    for force, good in (
+        (lambda x: -x, True),
+        (lambda x: -(x**3), False),  # 3.4 times at 1.5
+        (lambda x: -0.6 * x - 0.4 * x**3, True),
+        (lambda x: 0.1 * x, False),
+        (lambda x: 0.3 - x**2, False),
+        (lambda x: 0.0 * x + 0.2, True),
+    ):
+        assert holds(force, x, force(x), 0.0) == good
+        assert not holds(lambda x: force(x) + 0.2, x, force(x), 0.0)
 
 
 def test_what_is_written_of_a_curve_stays_near_it():
