@@ -28,8 +28,8 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     WHOLE: {},
 }
 COLUMNS = (
-    "rule trials strict strict_whole lost won named named_whole false false_whole worse worse_whole "
-    "error seconds seconds_whole constants"
+    "rule trials strict strict_whole lost won named named_whole false false_whole "
+    "worse worse_whole error seconds seconds_whole constants"
 ).split()
 
 

@@ -24,18 +24,17 @@ MEMORY = 10.0  # rows that the smoothing correlates
 STILL = 0.02  # rad/s or m/s, over which the sign of the speed is smoothed
 
 
-def residual_force(model, recording):
-    """Smooth motion, motors' force, lacking force: (q, v, a, drives, lacking), (T, nv) each."""
+def forces(model, recording):
+    """(q, v, a, drives, needed): smooth motion, motors' force, what the motion needs, (T, nv)."""
     qpos, qvel, qacc = states(recording, model)
-    data, lacking, drives = mujoco.MjData(model), [], []
+    data, wanted, drives = mujoco.MjData(model), [], []
     for q, v, a, u in zip(qpos, qvel, qacc, recording.ctrl):
         data.qpos[:], data.qvel[:], data.qacc[:], data.ctrl[:] = q, v, a, u
         mujoco.mj_inverse(model, data)
-        needed = data.qfrc_inverse.copy()
+        wanted.append(data.qfrc_inverse.copy())
         mujoco.mj_fwdActuation(model, data)
         drives.append(data.qfrc_actuator.copy())
-        lacking.append(needed - data.qfrc_actuator)
-    return qpos, qvel, qacc, np.array(drives), np.array(lacking)
+    return qpos, qvel, qacc, np.array(drives), np.array(wanted)
 
 
 def terms(model, index, motion):
@@ -55,8 +54,8 @@ def terms(model, index, motion):
     return out
 
 
-def regress(columns, force):
-    """({effect: (value, standard error)}) of the terms that stay."""
+def regress(columns, force, usual):
+    """{effect: (value, standard error)} of the terms that stay; usual: RMS force of the joint."""
     names = list(columns)
     while names:
         matrix = np.stack([columns[n] for n in names], 1)
@@ -64,9 +63,7 @@ def regress(columns, force):
         left = force - matrix @ values
         spread = MEMORY * left @ left / max(len(force) - len(names), 1)
         errors = np.sqrt(spread * np.diag(np.linalg.pinv(matrix.T @ matrix)))
-        size = (
-            np.abs(values) * np.sqrt(np.mean(matrix**2, 0)) / (np.sqrt(np.mean(force**2)) + 1e-12)
-        )
+        size = np.abs(values) * np.sqrt(np.mean(matrix**2, 0)) / usual
         weak = np.minimum(size / SHARE, np.abs(values) / (ERRORS * errors + 1e-12))
         if weak.min() >= 1:
             return dict(zip(names, zip(values.tolist(), errors.tolist())))
@@ -78,7 +75,7 @@ def main():
     """Regress joint by joint, name the terms, write those that MJCF holds."""
     spec, recordings, out = arguments()
     model, findings = spec.compile(), []
-    motions = [residual_force(model, recording) for recording in recordings]
+    motions = [forces(model, recording) for recording in recordings]
     known = {(f.effect, f.name): f for f in fields(spec)}
     driver = {model.actuator_trnid[k, 0]: model.actuator(k).name for k in range(model.nu)}
     for index in range(model.njnt):
@@ -86,8 +83,11 @@ def main():
             continue
         each = [terms(model, index, motion) for motion in motions]
         columns = {name: np.concatenate([e[name] for e in each]) for name in each[0]}
-        force = np.concatenate([m[4][:, model.jnt_dofadr[index]] for m in motions])
-        for effect, (value, error) in regress(columns, force).items():
+        dof = model.jnt_dofadr[index]
+        needed = np.concatenate([m[4][:, dof] for m in motions])
+        force = needed - np.concatenate([m[3][:, dof] for m in motions])
+        usual = np.sqrt(np.mean(needed**2)) + 1e-12
+        for effect, (value, error) in regress(columns, force, usual).items():
             at_drive = effect in ("gain", "bias")
             if at_drive and index not in driver:
                 continue

@@ -3,7 +3,7 @@
     python prove.py run --development --seed 1 --trials 60 --jobs 2 --out results/development.csv
     python prove.py show --seed 1 --trial 15 --folder /tmp/t15       # draw a development trial
 
-    python prove.py seal --trials 600 --out results/final.seals      # then commit that file, alone
+    python prove.py seal --trials 600 --out results/final.seals --publish
     python prove.py run --seals results/final.seals --out results/proof_final.csv
     python prove.py audit results/proof_final.csv --seals results/final.seals
     python prove.py page results/proof_final.csv --out results/proof_final.html
@@ -59,6 +59,7 @@ def parse(words):
     )
     command.add_argument("--trials", type=int, default=600)
     command.add_argument("--out", type=Path, required=True, help="the seals; keys go to OUT.keys")
+    command.add_argument("--publish", action="store_true", help="commit the seals, alone")
     command = commands.add_parser("run", help="run trials and append them to a table")
     source = command.add_mutually_exclusive_group(required=True)
     source.add_argument("--development", action="store_true", help="trials of a plain seed")
@@ -98,7 +99,13 @@ def do_seal(options):
     write_whole(keys, "".join(f"{number} {key}\n" for number, key in enumerate(secret)))
     keys.chmod(0o600)
     write_whole(options.out, seals_text(secret))
-    print(f"{options.out}: commit it, alone. {keys}: keep it out of the history until the run.")
+    if not options.publish:
+        print(f"{options.out}: commit it, alone. {keys}: keep it out of the history for good.")
+        return
+    folder, name = options.out.resolve().parent, options.out.name
+    git("add", "--", name, folder=folder)
+    git("commit", "-m", f"Seals of {options.trials} trials", "--", name, folder=folder)
+    print(f"published by {publishing_commit(options.out)}; {keys}: keep it out of the history")
 
 
 def do_run(options):

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -37,9 +36,7 @@ COUNT, WHEN = 3, "2020-01-01T00:00:00Z"
 
 def git(folder, *words):
     who = ("-c", "user.name=a", "-c", "user.email=a@b.c")
-    when = {"GIT_AUTHOR_DATE": WHEN, "GIT_COMMITTER_DATE": WHEN}  # the same hash each time
-    done = {"cwd": folder, "check": True, "capture_output": True, "env": os.environ | when}
-    subprocess.run(["git", *who, *words], **done)
+    subprocess.run(["git", *who, *words], cwd=folder, check=True, capture_output=True)
 
 
 def command(monkeypatch, *words):
@@ -52,6 +49,8 @@ def published(tmp_path_factory):
     """(repository with published seals and a run's table, its rows, the tool's command line)."""
     patch = pytest.MonkeyPatch()
     folder = tmp_path_factory.mktemp("repository")
+    for name in ("GIT_AUTHOR_DATE", "GIT_COMMITTER_DATE"):
+        patch.setenv(name, WHEN)  # the same hash each time
     git(folder, "init", "-q")
     (folder / "readme").write_text("a repository")
     (folder / "silent.py").write_text(SILENT)
@@ -59,9 +58,9 @@ def published(tmp_path_factory):
     git(folder, "commit", "-qm", "Begin")
     seals = folder / "final.seals"
     patch.setattr(protocol, "new_keys", lambda count: [f"{k:032x}" for k in range(count)])
-    command(patch, "seal", "--trials", COUNT, "--out", seals)
-    git(folder, "add", "final.seals")
-    git(folder, "commit", "-qm", "Seals")
+    git(folder, "config", "user.name", "a")
+    git(folder, "config", "user.email", "a@b.c")
+    command(patch, "seal", "--trials", COUNT, "--out", seals, "--publish")
     patch.setitem(table.SETTINGS, "small", SMALL)
     commit = publishing_commit(seals)
     keys = read_pairs((folder / "final.seals.keys").read_text())
