@@ -253,7 +253,7 @@ def test_unknown_curves():
             (-1.0, -0.3, 0.2, 0.6, 1.0),
         ),  # pushes away, the farther the more
         ((-1.0, 0.0, 0.3, 0.35, 1.0), (0.1, 0.1, 0.1, -0.2, -0.2)),  # a step between two knots
-        ((-0.88, -0.7, -0.33, 0.75), (-0.1, 0.6, -0.5, -0.9)),  # at its knots only
+        ((-0.32, 0.11, 0.42, 0.54), (0.3, 0.9, 0.4, -0.3)),  # a cubic is right at its knots only
     ],
 )
 def test_a_polynomial_that_runs_away_is_not_written(knots, forces):
