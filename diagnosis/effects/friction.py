@@ -164,9 +164,9 @@ class LoadFriction(DryFriction):
     drive moves the joint (τ_drive · v ≥ 0), `driven` where the load does. external 1 is a train of
     gears between two loads, 0 counts the drive's side alone. All are ratios. With both shares
     equal and a constant load it is `coulomb_friction`; driving alone, without a load from outside,
-    is in motion a smaller `gain`. Sources: Duclusaud, Passault, Padois, Daniel: Extended Friction
-    Models for the Physics Simulation of Servo Actuators (2024), models M4 to M6; efficiency
-    forward and backward of gears: Linderoth, Stolt, Robertsson, Johansson (2013).
+    is in motion a smaller `gain`. Source: the load-dependent and directional models M4 to M6 of
+    Duclusaud, Passault, Padois, Ly: Extended Friction Models for the Physics Simulation of Servo
+    Actuators (arXiv 2410.08650, 2024), here with shares by which side moves the joint.
     """
 
     name, law, amplitudes = "load_friction", "load_friction", 2

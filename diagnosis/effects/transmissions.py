@@ -283,7 +283,7 @@ class CoupledFriction(CoupledEffect):
 
     As in differential wrists, linkages and belts that run through a joint. Beside
     `coulomb_friction` of each joint, which opposes its own speed. Source: MuJoCo's tendon
-    frictionloss; Siciliano et al., Robotics (2009), 5.4 on transmissions.
+    frictionloss.
     """
 
     name, number, field, acts_through = "coupled_friction", "level", "frictionloss", "velocity"
