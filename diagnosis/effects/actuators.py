@@ -160,7 +160,10 @@ class ServoDamping(ServoGain):
 
 @catalogue
 class Gain(ActuatorEffect):
-    """The actuator is stronger or weaker by a ratio, feedback of a servo included."""
+    """Force gain·F: the actuator is stronger or weaker by a ratio, feedback of a servo included.
+
+    Source: MuJoCo's gainprm and biasprm; a wrong motor constant, ratio or supply.
+    """
 
     name, simplicity, related = "gain", 0, ("mass", "armature", "viscous_damping", "stiffness")
     acts_through = "control"
@@ -181,7 +184,7 @@ class Gain(ActuatorEffect):
 
 @catalogue
 class Bias(ActuatorEffect):
-    """A constant actuator force on top."""
+    """Force F + bias, in N·m or N of the actuator. Source: MuJoCo's biasprm[0]."""
 
     name, related = "bias", ("spring_offset", "gravity")
 
@@ -199,7 +202,11 @@ class Bias(ActuatorEffect):
 
 @catalogue
 class BackEmf(ActuatorEffect):
-    """A force −d·(actuator velocity): back-EMF, or the velocity gain of a servo."""
+    """A force −d·v, v of the actuator, d in N·m·s/rad or N·s/m: back-EMF, or a servo's velocity
+    gain.
+
+    In a drive on one joint it is `viscous_damping`, but for a limited force. Source: biasprm[2].
+    """
 
     name, related = "back_emf", ("viscous_damping", "gain", "lag")
     acts_through = "velocity"
@@ -225,7 +232,10 @@ class BackEmf(ActuatorEffect):
 
 @catalogue
 class Saturation(ActuatorEffect):
-    """The force is cut off at ± forcerange (of a range that is not symmetric: its larger end)."""
+    """|F| ≤ forcerange (of a range that is not symmetric: its larger end), N·m or N.
+
+    Source: MuJoCo's forcerange; the limit of a motor's current.
+    """
 
     name, related = "saturation", ("gain",)
     acts_through = "control"
@@ -268,7 +278,8 @@ class Saturation(ActuatorEffect):
 
 @catalogue
 class Lag(ActuatorEffect):
-    """The command passes a first-order filter."""
+    """The command passes a first-order filter: seconds · ẏ = u − y. Source: MuJoCo's
+    filterexact."""
 
     name, related = "lag", ("delay", "back_emf", "time_step")
     acts_through = "control"
@@ -296,7 +307,8 @@ class Lag(ActuatorEffect):
 
 @catalogue
 class Delay(ActuatorEffect):
-    """The command acts later, by any fraction of a time step."""
+    """The command acts later: u(t − seconds), by any fraction of a time step. Source: MuJoCo's
+    delay."""
 
     name, simplicity, related = "delay", 0, ("lag", "sensor_delay", "time_step")
     acts_through = "control"

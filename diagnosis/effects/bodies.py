@@ -57,7 +57,7 @@ class InertialEffect(Effect):
 
 @catalogue
 class Mass(InertialEffect):
-    """Another mass; the inertia scales along."""
+    """Another mass, kg; the inertia scales along. Source: MuJoCo's inertial."""
 
     name, simplicity, related = "mass", 0, ("gain", "armature", "inertia", "center_of_mass")
 
@@ -93,7 +93,8 @@ def _size(model, i):
 
 @catalogue
 class CenterOfMass(InertialEffect):
-    """The centre of mass lies elsewhere in the body's frame."""
+    """The centre of mass lies elsewhere in the body's frame: x, y, z, m. Source: MuJoCo's
+    inertial."""
 
     name, related = "center_of_mass", ("mass", "inertia")
 
@@ -113,7 +114,11 @@ class CenterOfMass(InertialEffect):
 
 @catalogue
 class Inertia(InertialEffect):
-    """Other principal moments of inertia about the centre of mass."""
+    """Other principal moments of inertia about the centre of mass, kg·m², in the body's inertial
+    axes.
+
+    Of a rigid body none is larger than the sum of the others. Source: MuJoCo's inertial.
+    """
 
     name, related = "inertia", ("mass", "armature")
 
@@ -169,7 +174,8 @@ def rigid(moments):
 
 @catalogue
 class LinkLength(Effect):
-    """The body hangs farther from, or nearer to, its parent than the model says."""
+    """The body hangs farther from, or nearer to, its parent than the model says: metres to its
+    frame."""
 
     name, kinds, constants = "link_length", ("body",), True
 
@@ -202,7 +208,7 @@ class LinkLength(Effect):
 
 @catalogue
 class ExternalForce(Effect):
-    """A constant force on a body's centre of mass, in world axes."""
+    """A constant force on a body's centre of mass, in world axes: x, y, z, N."""
 
     name, kinds, simplicity, related = (
         "external_force",
@@ -237,7 +243,7 @@ class ExternalForce(Effect):
 
 @catalogue
 class PayloadChange(Mass):
-    """Another mass of a body for part of the time."""
+    """Another mass of a body for part of the time, kg; the inertia scales along."""
 
     name, timed, simplicity = "payload_change", True, 3
 
@@ -273,7 +279,7 @@ class SensorEffect(Effect):
 
 @catalogue
 class SensorBias(SensorEffect):
-    """The sensor's zero is off: it reads value + offset."""
+    """The sensor's zero is off: it reads value + offset, in rad, m or its own unit."""
 
     name = "sensor_bias"
 
@@ -331,7 +337,7 @@ class SensorBias(SensorEffect):
 
 @catalogue
 class SensorScale(SensorEffect):
-    """The sensor reads value · ratio."""
+    """The sensor reads value · ratio; its speed too."""
 
     name = "sensor_scale"
 
@@ -351,7 +357,7 @@ class SensorScale(SensorEffect):
 
 @catalogue
 class SensorDelay(SensorEffect):
-    """The sensor shows what was true some time ago."""
+    """The sensor shows what was true some time ago: value(t − seconds)."""
 
     name, related = "sensor_delay", ("delay", "time_step")
 

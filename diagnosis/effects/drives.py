@@ -89,7 +89,11 @@ def drive_torque(models, j):
 
 @catalogue
 class DeadZone(ActuatorEffect):
-    """Nothing happens below a threshold: of the control (motor) or of the force (servo)."""
+    """Nothing happens below a threshold: y = sign(x) · max(|x| − half_width, 0).
+
+    x is the control of a motor, in its units, the force of a servo, in N·m or N. A servo's is
+    `coulomb_friction` that acts at rest alone.
+    """
 
     name, simplicity, amplitudes, related = "dead_zone", 2, 1, ("coulomb_friction", "gain")
     acts_through = "control"

@@ -15,7 +15,7 @@ FACTORS = (
 
 @catalogue
 class Gravity(Effect):
-    """Another gravity vector: a tilted base, another strength."""
+    """Another gravity vector, m/s²: a tilted base, another strength. Source: MuJoCo's option."""
 
     name, kinds, simplicity, related = "gravity", ("world",), 0, ("spring_offset", "bias", "mass")
 
@@ -34,7 +34,8 @@ class Gravity(Effect):
 
 @catalogue
 class Wind(Effect):
-    """Moving air; felt only where the model has density or viscosity."""
+    """Moving air, m/s; felt only where the model has density or viscosity. Source: MuJoCo's
+    option."""
 
     name, kinds = "wind", ("world",)
 
@@ -65,7 +66,11 @@ class Wind(Effect):
 
 @catalogue
 class AirDrag(Effect):
-    """A medium of some density around the bodies (MuJoCo's inertia-box drag)."""
+    """A medium of some density around the bodies, kg/m³.
+
+    Force −ρ A w|w|/2 on each face of the box of a body's inertia. Source: MuJoCo's inertia-box
+    drag.
+    """
 
     name, kinds, related = "air_drag", ("world",), ("quadratic_damping", "viscous_damping")
 
@@ -86,7 +91,7 @@ class AirDrag(Effect):
 
 @catalogue
 class TimeStep(Effect):
-    """The simulator's own integration step: what it leaves out is no physics."""
+    """The simulator's own integration step, s: what it leaves out is no physics."""
 
     name, kinds = "time_step", ("world",)
 
@@ -203,7 +208,8 @@ def _direct(solref):
 
 @catalogue
 class ContactFriction(ContactEffect):
-    """Sliding friction of all contacts of a geom."""
+    """Sliding friction μ of all contacts of a geom: |F_t| ≤ μ F_n. Source: MuJoCo's geom
+    friction."""
 
     name, simplicity = "contact_friction", 0
 
@@ -223,7 +229,8 @@ class ContactFriction(ContactEffect):
 
 @catalogue
 class ContactStiffness(ContactEffect):
-    """Stiffness of all contacts of a geom, as an acceleration per depth."""
+    """Stiffness of all contacts of a geom, as an acceleration per depth, 1/s². Source:
+    solref[0]."""
 
     name, related = "contact_stiffness", ("contact_damping",)
 
@@ -241,7 +248,8 @@ class ContactStiffness(ContactEffect):
 
 @catalogue
 class ContactDamping(ContactEffect):
-    """Damping of all contacts of a geom, as an acceleration per approach speed."""
+    """Damping of all contacts of a geom, an acceleration per approach speed, 1/s. Source:
+    solref[1]."""
 
     name, related = "contact_damping", ("contact_stiffness",)
 
@@ -259,7 +267,7 @@ class ContactDamping(ContactEffect):
 
 @catalogue
 class GroundHeight(Effect):
-    """A fixed geom lies higher or lower."""
+    """A fixed geom lies higher or lower: z of its position in its body, m."""
 
     name, kinds, constants, acts_through = "ground_height", ("geom",), True, "contact"
 

@@ -131,7 +131,10 @@ class JointNumber(JointEffect):
 
 @catalogue
 class Armature(JointNumber):
-    """Inertia of rotor and gears, in the joint's own coordinate."""
+    """Inertia J of rotor and gears in the joint's own coordinate: force −J q̈. kg·m² or kg.
+
+    Source: MuJoCo's joint armature; a rotor of J_r behind gears of ratio n adds n² J_r.
+    """
 
     name, types, constants, related = "armature", (HINGE, SLIDE, BALL), True, ("mass", "gain")
     number, compiled, authored, step = (
@@ -144,7 +147,7 @@ class Armature(JointNumber):
 
 @catalogue
 class ViscousDamping(JointNumber):
-    """Force −d·v."""
+    """Force −d·v, d in N·m·s/rad or N·s/m. Source: MuJoCo's joint damping; Newtonian grease."""
 
     name, types, simplicity, related = "viscous_damping", (HINGE, SLIDE, BALL), 0, DISSIPATION
     acts_through = "velocity"
@@ -157,7 +160,7 @@ class ViscousDamping(JointNumber):
 
 @catalogue
 class QuadraticDamping(JointNumber):
-    """Force −d·v·|v|."""
+    """Force −d·v·|v|, d in N·m·s²/rad² or N·s²/m². Source: MuJoCo's damping polynomial; a fan."""
 
     name, related = "quadratic_damping", DISSIPATION
     acts_through = "velocity"
@@ -177,7 +180,11 @@ class QuadraticDamping(JointNumber):
 
 @catalogue
 class CoulombFriction(JointNumber):
-    """Dry friction, which holds the joint below its limit."""
+    """Dry friction: |F| ≤ frictionloss, against the motion or holding the joint. N·m or N.
+
+    Of a level that differs by direction it is this and a `spring_offset`: half their sum, and half
+    their difference. Source: MuJoCo's frictionloss, as stiff as a stuck joint needs.
+    """
 
     name, types, simplicity, related = "coulomb_friction", (HINGE, SLIDE, BALL), 0, DISSIPATION
     acts_through = "velocity"
@@ -203,7 +210,7 @@ class CoulombFriction(JointNumber):
 
 @catalogue
 class Stiffness(JointNumber):
-    """Force −k·(q − springref)."""
+    """Force −k·(q − springref), k in N·m/rad or N/m. Source: MuJoCo's joint stiffness."""
 
     name, related = "stiffness", ("spring_offset", "nonlinear_stiffness", "gain")
     acts_through = "position"
@@ -217,7 +224,7 @@ class Stiffness(JointNumber):
 
 @catalogue
 class NonlinearStiffness(JointNumber):
-    """Force −k·(q − springref)³."""
+    """Force −k·(q − springref)³, k in N·m/rad³ or N/m³. Source: MuJoCo's stiffness polynomial."""
 
     name, simplicity, related = "nonlinear_stiffness", 2, ("stiffness", "spring_offset")
     acts_through = "position"
@@ -240,7 +247,10 @@ class NonlinearStiffness(JointNumber):
 
 @catalogue
 class SpringOffset(JointEffect):
-    """A constant force in the joint: a spring at rest elsewhere, a tilt, a cable."""
+    """A constant force in the joint, N·m or N: a spring at rest elsewhere, a tilt, a cable.
+
+    With `coulomb_friction` beside it, friction that differs by direction.
+    """
 
     name, related = "spring_offset", ("stiffness", "bias", "coulomb_friction")
 
@@ -269,7 +279,11 @@ class SpringOffset(JointEffect):
 
 @catalogue
 class Cogging(JointEffect):
-    """Force amplitude·sin(poles·q + phase), as of a motor's magnets."""
+    """Force amplitude·sin(poles·q + phase), as of a motor's magnets.
+
+    amplitude in N·m (N), poles per rad (rad/m), phase in rad. Source: the cogging of MuJoCo's
+    dcmotor.
+    """
 
     name, simplicity, amplitudes, together = "cogging", 3, 1, 2
     acts_through = "position"
@@ -342,7 +356,7 @@ class Cogging(JointEffect):
 
 @catalogue
 class JointStop(JointEffect):
-    """The joint is limited to [low, high]."""
+    """The joint is limited to [low, high], in rad or m. Source: MuJoCo's joint range."""
 
     name, simplicity = "joint_stop", 2
     acts_through = "position"
