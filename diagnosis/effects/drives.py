@@ -91,8 +91,8 @@ def drive_torque(models, j):
 class DeadZone(ActuatorEffect):
     """Nothing happens below a threshold: y = sign(x) · max(|x| − half_width, 0).
 
-    x is the control of a motor, in its units, the force of a servo, in N·m or N. A servo's is
-    `coulomb_friction` that acts at rest alone.
+    x is the control of a motor, in its units, the force of a servo, in N·m or N. Where the drive
+    pushes the way the joint moves it takes as much as `coulomb_friction`.
     """
 
     name, simplicity, amplitudes, related = "dead_zone", 2, 1, ("coulomb_friction", "gain")
