@@ -424,3 +424,39 @@ for _env_id in ENV_IDS:  # on import, as gymnasium asks for it
     gymnasium.register(
         f"rgat/{_env_id}", vector_entry_point=_registered, kwargs={"env_id": _env_id}
     )
+
+
+class SingleEnv(gymnasium.Env):
+    """One robot of a BatchEnv as a gymnasium.Env: gymnasium.make("rgat/Hopper-v5", real="torso:mass*1.27").
+
+    real: as train.py's --real; "" for the sim.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, env_id, real=""):
+        self.batch = BatchEnv(env_id, 1, parse_perturbation(real), nthread=1)
+        self.observation_space = self.batch.single_observation_space
+        self.action_space = self.batch.single_action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.batch.reset(seed=seed)[0][0], {}
+
+    def step(self, action):
+        _, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
+        return info["next_obs"][0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+
+def vector_env(num_envs, env_id, real="", **kwargs):
+    """gymnasium.make_vec("rgat/Hopper-v5", num_envs=32): a BatchEnv."""
+    return BatchEnv(env_id, num_envs, parse_perturbation(real), **kwargs)
+
+
+for _env_id in (name for name in ENV_IDS if f"rgat/{name}" not in gymnasium.registry):
+    gymnasium.register(
+        f"rgat/{_env_id}",
+        entry_point=SingleEnv,
+        vector_entry_point=vector_env,
+        kwargs={"env_id": _env_id},
+    )

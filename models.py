@@ -157,10 +157,13 @@ class GaussianPolicy(nn.Module):
     """pi(a|s) = N(mean_theta(s), diag(exp(log_std))^2): an MLP mean and a state-independent log_std.
 
     Args: nobs, nact: widths. hidden: hidden layer widths. log_std: initial value for every action dimension.
+    low, high: the robot's bounds of an action, (nact,), which action() keeps; what is learnt from is unbounded.
     """
 
-    def __init__(self, nobs, nact, hidden=DEEP, log_std=0.0):
+    def __init__(self, nobs, nact, hidden=DEEP, log_std=0.0, low=-math.inf, high=math.inf):
         super().__init__()
+        for name, bound in (("low", low), ("high", high)):
+            self.register_buffer(name, torch.as_tensor(bound).float().expand(nact).clone())
         self.sizes = (nobs, *hidden, nact)
         self.normalizer = Normalizer(nobs)
         self.net = MLP(self.sizes, last_gain=0.01)  # starts near mean 0 everywhere
@@ -170,6 +173,11 @@ class GaussianPolicy(nn.Module):
     def mean(self, obs):
         """The deterministic action, (N, nact), for obs (N, nobs)."""
         return self.net(self.normalizer(obs))
+
+    @torch.no_grad()
+    def action(self, obs):
+        """What a robot should do, (N, nact), within its bounds, for obs (N, nobs)."""
+        return torch.clamp(self.mean(obs), self.low, self.high)
 
     def forward(self, obs):
         """Mean (N, nact) and log_std (nact,)."""

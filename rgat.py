@@ -39,8 +39,27 @@ class GroundedEnv(VectorWrapper):
         super().__init__(env)
         self.transformer = transformer
 
-    def step(self, actions):
-        return self.env.step(actions, applied=self.transformer(self.env.obs, actions))
+    def reset(self, *, seed=None, options=None):
+        self.obs, info = self.env.reset(seed=seed, options=options)
+        return self.obs.copy(), info
+
+    def step(self, actions, applied=None):
+        """As BatchEnv.step; applied: what a transformer in front of this one made of the actions."""
+        a_hat = self.transformer(self.obs, actions if applied is None else applied)
+        self.obs, *rest = self.env.step(actions, applied=a_hat)
+        return self.obs.copy(), *rest
+
+
+def grounded_env(run, num_envs=1, step=None):
+    """The grounded simulator of a finished run, RGAT's product: a gymnasium vector environment to train any policy in.
+
+    run: the run's folder. step: the grounding step whose simulator it is, the last by default.
+    Raises training.run_folder.RunError for a folder that holds no such step.
+    """
+    from train import loaded_grounding
+
+    grounding = loaded_grounding(run, num_envs, step)
+    return GroundedEnv(grounding.sim, grounding.transformer)
 
 
 class RealModel:
@@ -353,6 +372,9 @@ class ANE(Grounding):
 
         self.transformer = noisy
         return {}
+
+    def load(self, state):
+        self.update(None, 0, seed=0)
 
 
 class Solver(Grounding):

@@ -24,7 +24,15 @@ from envs import BatchEnv, EnvError, parse_perturbation
 from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint, torch_threads
 from rgat import METHODS, RGAT, GroundedEnv, Solved, identity, one_step_error
 from training.physics_grounding import Physics, PhysicsThen
-from training.run_folder import Bar, Run, RunError, animate, save_whole, versions
+from training.run_folder import (
+    Bar,
+    Run,
+    RunError,
+    animate,
+    save_whole,
+    tensorboard,
+    versions,
+)
 from training.settings import Settings, kind_of, seed_for, settings_of
 from trpo import TRPO, Transitions, rollouts
 
@@ -136,6 +144,7 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
         {"learner": learner.state(), "grounding": transformer, "acting": acting},
         tau_new,
     )
+    bar.scalars("on real", row, step)
     bar.say(
         f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real"
     )
@@ -187,10 +196,32 @@ def start(s, run, sim, real, bar):
         bar.lap()
         return learner, grounding, tau_real
 
-    learner.load(pretrained(s, "real" if s.algo == "real" else "sim", world, s.pretrain_steps, bar))
+    if s.policy_from:
+        take_over(s, learner, world, bar)
+    else:
+        name = "real" if s.algo == "real" else "sim"
+        learner.load(pretrained(s, name, world, s.pretrain_steps, bar))
     reference(s, run, learner, real, bar)
     record(s, run, 0, learner, grounding, real, tau_real, {}, bar)
     return learner, grounding, tau_real
+
+
+def loaded_grounding(folder, num_envs, step=None):
+    """The Grounding that a run's grounding step left (the last one by default), in num_envs simulations."""
+    run, saved = Run.open(folder)
+    s, done = settings_of(folder, saved), len(run.progress) - 1
+    step = done if step is None else step
+    if not 1 <= step <= done:
+        raise RunError(f"{folder} has no grounding step {step}: it has done {max(done, 0)}")
+    sim = BatchEnv(s.env, num_envs)
+    real = BatchEnv(s.env, 1, parse_perturbation(s.real))
+    told = (real.model,) if s.algo == "oracle" else ()
+    grounding = GROUNDINGS[s.algo](sim, s.grounding, *told)
+    try:
+        grounding.load(run.checkpoint(step)["grounding"])
+    except UNSOUND:
+        raise RunError(f"{folder}/step_{step:02d}.pt does not belong to this run") from None
+    return grounding
 
 
 def reference(s, run, learner, real, bar):
@@ -213,8 +244,26 @@ def new_learner(s):
     torch.manual_seed(seed_for(s.seed, 0, "networks"))
     env = BatchEnv(s.env, 1)
     nobs, nact = env.single_observation_space.shape[0], env.single_action_space.shape[0]
-    policy = GaussianPolicy(nobs, nact, {"deep": DEEP, "shallow": SHALLOW}[s.policy])
+    box, hidden = env.single_action_space, {"deep": DEEP, "shallow": SHALLOW}[s.policy]
+    policy = GaussianPolicy(nobs, nact, hidden, low=box.low, high=box.high)
     return TRPO(policy, Value(nobs), s.target)
+
+
+def take_over(s, learner, world, bar):
+    """Begin with the policy of a file, and give it a critic of the world that it improves in."""
+    try:
+        policy = GaussianPolicy.load(s.policy_from)
+    except ValueError as error:
+        raise RunError(f"--policy-from: {error}") from None
+    if policy.sizes != learner.policy.sizes:
+        raise RunError(
+            f"--policy-from {s.policy_from} has layers of {policy.sizes}, --env {s.env} and --policy {s.policy} "
+            f"make {learner.policy.sizes}"
+        )
+    learner.policy.load_state_dict(policy.state_dict())
+    learner.value.normalizer.load_state_dict(policy.normalizer.state_dict())
+    seed, log = seed_for(s.seed, 0, "pretrain"), bar.phase(0, "critic")
+    learner.learn(world, s.pretrain_steps, seed, on_update=log, critic_alone=True)
 
 
 def pretrained(s, world, env, steps, bar):
@@ -330,6 +379,11 @@ def parse(argv):
         metavar="RUN",
         help="animate the best policy of this run on sim and real, to RUN/replay.gif",
     )
+    parser.add_argument(
+        "--tensorboard",
+        action="store_true",
+        help="write TensorBoard's scalars into the run's folder too",
+    )
     args = parser.parse_args(argv)
     given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default] + [
         "out"
@@ -377,7 +431,7 @@ def main(argv=None):
             ).completed()
             run = Run.create(args.out or f"runs/{s.env}-{s.algo}-s{s.seed}", dataclasses.asdict(s))
         with quiet():  # MuJoCo's own warnings: an unstable simulation is told below, in one line
-            algorithm_1(s, run, Bar(s, run))
+            algorithm_1(s, run, Bar(s, run, args.tensorboard and tensorboard(run.folder)))
             print(verdict(s, run))
         return 0
     except (EnvError, RunError, WriteError) as error:

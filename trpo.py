@@ -12,7 +12,7 @@ line search the largest step that really keeps both promises.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -264,10 +264,11 @@ class TRPO:
         """Transitions of one update in env: the batch size in whole rows of its environments."""
         return max(1, self.config.batch_size // env.num_envs) * env.num_envs
 
-    def learn(self, env, steps, seed, freeze_normalizer=True, on_update=None):
+    def learn(self, env, steps, seed, freeze_normalizer=True, on_update=None, critic_alone=False):
         """Train on env for at least `steps` transitions, in whole batches; seed decides every random number.
 
-        freeze_normalizer: keep the observation statistics as they are. on_update(stats) is called with a dict after
+        freeze_normalizer: keep the observation statistics as they are. critic_alone: keep the policy, which came without a
+        critic: an improvement by one that knows nothing yet would ruin it. on_update(stats) is called with a dict after
         every update of the policy; the value may then still be fitting, and stands still once learn returns.
         """
         as_vector(self.policy)
@@ -284,7 +285,7 @@ class TRPO:
                 batch, obs = self.collect(env, obs, horizon)
                 done_steps += horizon * env.num_envs
                 value_fit.result()
-                stats, value_fit = self.update(batch, beside)
+                stats, value_fit = self.update(batch, beside, critic_alone)
                 if adapt:
                     for network in (self.policy, self.value):
                         network.normalizer.update(
@@ -341,7 +342,7 @@ class TRPO:
             config.lam,
         ), value
 
-    def update(self, batch, beside):
+    def update(self, batch, beside, critic_alone=False):
         """Update the policy from collect()'s arrays and start fitting the value in `beside`, an executor.
 
         Returns the statistics to log, and the future that ends with the fit.
@@ -353,9 +354,9 @@ class TRPO:
         value_fit = beside.submit(
             value_update(self.value, self.optimizer, obs, targets, self.config, self.generator)
         )
-        stats = policy_update(
-            self.policy, obs, action, torch.from_numpy(advantage.reshape(-1)), self.config
-        )
+        wanted = torch.from_numpy(advantage.reshape(-1) * (not critic_alone))
+        config = replace(self.config, entropy=0.0) if critic_alone else self.config
+        stats = policy_update(self.policy, obs, action, wanted, config)
         stats["explained_variance"] = explained_variance(value, returns)
         stats["std"] = float(self.policy.log_std.detach().exp().mean())
         stats["reward"] = float(batch["reward"].mean())

@@ -7,7 +7,6 @@ returns = rollouts(ActingPolicy(model), env, 20, seed=0, deterministic=True)[0]
 
 import numpy as np
 import torch
-from sb3_contrib import TRPO
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 
@@ -47,7 +46,7 @@ class SB3Env(VecEnv):
         pass
 
     def get_attr(self, attr_name, indices=None):
-        return [getattr(self.env, attr_name, None)] * self.num_envs
+        return [getattr(self.env, attr_name)] * self.num_envs
 
     def set_attr(self, attr_name, value, indices=None):
         raise NotImplementedError("the copies of a batch share their attributes")
@@ -66,6 +65,8 @@ def trpo_model(env, config, seed, hidden=(64, 64)):
     What it lacks: the entropy bonus (0 in every preset) and the scaling of the value function's
     targets.
     """
+    from sb3_contrib import TRPO
+
     vec = env if isinstance(env, VecEnv) else SB3Env(env)
     if config.normalize_obs:
         vec = VecNormalize(vec, norm_reward=False)

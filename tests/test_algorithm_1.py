@@ -47,14 +47,16 @@ def spied(tmp_path, monkeypatch):
 
         def learn(self, env, steps, seed, freeze_normalizer=True, on_update=None):
             log.append(("learn", world(env), steps, seed, freeze_normalizer, self))
-            self.policy.net[-1].bias.data.fill_({"sim": 1.0, "real": 2.0}.get(world(env), 3.0))
+            self.policy.net[-1].bias.data.fill_(
+                {"sim": 1.0, "real": 2.0}.get(world(env), 3.0 + len(log))
+            )
             on_update({"steps": steps, "return": 1.0})
 
         def rollouts(policy, env, episodes, seed, deterministic=False):
             rows = np.full((episodes, 4), len(log), np.float32)
-            trained_in = {0.0: "nothing", 1.0: "sim", 2.0: "real", 3.0: "grounded"}
+            trained_in = {0.0: "nothing", 1.0: "sim", 2.0: "real"}
             told = world(env), episodes, seed, deterministic
-            log.append(("rollouts", *told, trained_in[policy.net[-1].bias.item()]))
+            log.append(("rollouts", *told, trained_in.get(policy.net[-1].bias.item(), "grounded")))
             found = next(judged) if deterministic else -1.0
             return np.full(episodes, found), Transitions(rows, rows[:, :1], rows)
 
@@ -255,5 +257,11 @@ def test_a_roll_back_is_asked_of_the_best_not_of_the_last(spied):
     assert [row["rolled_back_to"] for row in run.progress] == ["", 0, ""]
     _, run, _ = spied(returns=(9.0, -10.0, -12.0, -10.5), roll_back=0.9)
     assert [row["rolled_back_to"] for row in run.progress] == ["", 0, ""]
+    _, run, _ = spied(returns=(9.0, 5.0, 10.0, 8.0), roll_back=0.9)
+    assert [row["rolled_back_to"] for row in run.progress] == ["", "", 1]
+    first, best, last = (run.checkpoint(k) for k in range(3))
+    bias = lambda saved: saved["learner"]["policy"]["net.4.bias"].item()
+    assert bias(last) == bias(best) != bias(first)
+    assert last["acting"]["state"]["net.4.bias"].item() not in (bias(best), bias(first))
     _, run, _ = spied(returns=(9.0, 10.0, 1.0, 1.0))
     assert [row["rolled_back_to"] for row in run.progress] == ["", "", ""]

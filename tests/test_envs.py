@@ -6,6 +6,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import envs
@@ -447,6 +448,46 @@ def test_the_transformer_sees_the_present_observation_even_after_a_restart():
         np.testing.assert_array_equal(seen[-1], given)
         restarts += terminated.sum()
     assert restarts > 0
+
+
+def test_a_transformer_before_a_transformer():
+    inner = GroundedEnv(BatchEnv("Hopper-v4", 2, nthread=1), lambda obs, a: a + 0.1)
+    outer, plain = GroundedEnv(inner, lambda obs, a: 0.5 * a), BatchEnv("Hopper-v4", 2, nthread=1)
+    outer.reset(seed=0), plain.reset(seed=0)
+    a = np.full((2, 3), 0.4)
+    for _ in range(30):
+        ours, theirs = outer.step(a), plain.step(a, applied=0.5 * a + 0.1)
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        np.testing.assert_array_equal(ours[1], theirs[1])
+
+
+@pytest.mark.parametrize("env_id", envs.ENV_IDS)
+def test_gymnasium_makes_and_checks_the_registered_robots(env_id):
+    one = gymnasium.make(f"rgat/{env_id}")
+    check_env(one.unwrapped, skip_render_check=True)
+    many = gymnasium.make_vec(f"rgat/{env_id}", num_envs=3)
+    assert isinstance(many, BatchEnv) and many.num_envs == 3
+    obs, _ = one.reset(seed=4)
+    np.testing.assert_array_equal(many.reset(seed=4)[0][0], obs)
+    action = np.full(one.action_space.shape, 0.1, np.float32)
+    for _ in range(40):
+        obs, reward, terminated, truncated, _ = one.step(action)
+        step = many.step(np.tile(action, (3, 1)))
+        np.testing.assert_array_equal(obs, step[4]["next_obs"][0])
+        assert (reward, terminated, truncated) == (step[1][0], step[2][0], step[3][0])
+        if terminated:
+            break
+
+
+def test_sb3_checks_a_registered_robot():
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    checker.check_env(gymnasium.make("rgat/Hopper-v5"))
+
+
+def test_a_registered_robot_can_be_the_real_one():
+    real = gymnasium.make("rgat/Hopper-v5", real="torso:mass*1.27").unwrapped.batch.model
+    sim = gymnasium.make("rgat/Hopper-v5").unwrapped.batch.model
+    assert real.body("torso").mass[0] == pytest.approx(1.27 * sim.body("torso").mass[0])
 
 
 def test_peek_sees_the_next_step_and_moves_nothing():

@@ -13,10 +13,12 @@ import torch
 from PIL import Image
 
 ROOT = str(Path(__file__).resolve().parents[1])
+import rgat
 import train
 import trpo
 from envs import BatchEnv
 from models import GaussianPolicy
+from rgat import GroundedEnv
 from training import run_folder
 from training.settings import ALGOS
 
@@ -254,6 +256,88 @@ def test_a_kill_while_writing_loses_nothing_that_was_whole(write, tmp_path, fini
     assert train.main(["--resume", str(folder)]) == 0
     assert_same_run(folder, finished("rgat"))
 
+
+# --- what a run leaves to others ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algo", ["rgat", "gat", "ane", "solved", "sim"])
+def test_the_grounded_simulator_of_a_finished_run(algo, finished):
+    folder = finished(algo)
+    env = rgat.grounded_env(folder, num_envs=3)
+    obs, _ = env.reset(seed=0)
+    assert obs.shape == (3, 4) and env.num_envs == 3
+    saved = torch.load(folder / "step_02.pt", weights_only=True)
+    grounding = train.GROUNDINGS[algo](
+        BatchEnv(ENV, 3), train.Settings(env=ENV).completed().grounding
+    )
+    grounding.load(saved["grounding"])
+    expected = GroundedEnv(grounding.sim, grounding.transformer)
+    expected.reset(seed=0)
+    a = np.array([[0.5], [-1.0], [2.0]], np.float32)
+    for _ in range(5):
+        ours, theirs = env.step(a), expected.step(a)
+        np.testing.assert_array_equal(ours[0], theirs[0])
+    changed = grounding.transformer(theirs[0], a) if algo != "ane" else a + 1
+    assert np.array_equal(changed, a) == (algo == "sim")
+
+
+def test_sb3_trains_in_a_runs_grounded_simulator(finished):
+    sb3 = pytest.importorskip("stable_baselines3")
+    from sb3_adapter import SB3Env
+
+    model = sb3.PPO("MlpPolicy", SB3Env(rgat.grounded_env(finished("rgat"), 4)), n_steps=64)
+    model.learn(512)
+    assert model.num_timesteps == 512
+
+
+def test_a_run_without_that_grounding_step_is_named(finished, tmp_path):
+    for folder, step in ((finished("rgat"), 3), (finished("rgat"), 0), (tmp_path, None)):
+        with pytest.raises(run_folder.RunError, match=str(folder)):
+            rgat.grounded_env(folder, step=step)
+
+
+def test_a_saved_policy_keeps_its_robots_bounds(finished):
+    policy = GaussianPolicy.load(finished("rgat") / "policy.pt")
+    assert policy.low.tolist() == [-3] and policy.high.tolist() == [3]
+    policy.net[-1].bias.data.fill_(50.0)
+    assert policy.action(torch.zeros(2, 4)).tolist() == [[3.0]] * 2
+    assert (policy.mean(torch.zeros(2, 4)) > 40).all()
+
+
+def test_a_run_begins_with_the_policy_of_a_file(finished, tmp_path, capfd):
+    given = finished("rgat") / "policy.pt"
+    told = ["--policy-from", str(given), "--grounding-steps", "1"]
+    assert train.main(command(tmp_path / "run", "rgat", ENV, *told)) == 0
+    first = torch.load(tmp_path / "run" / "step_00.pt", weights_only=True)
+    theirs = torch.load(given, weights_only=True)["state"]
+    assert all(torch.equal(v, theirs[k]) for k, v in first["acting"]["state"].items())
+    untrained = train.new_learner(train.Settings(env=ENV, seed=3).completed()).value
+    weights = first["learner"]["value"]["net.0.weight"]
+    assert not torch.equal(weights, untrained.state_dict()["net.0.weight"])
+    rows = [r for r in table(tmp_path / "run" / "train.csv") if r["phase"] == "critic"]
+    assert rows and {float(r["kl"]) for r in rows} == {0.0}
+    refused(command(tmp_path / "b", "rgat", ENV, "--policy-from", "none.pt"), capfd, "none.pt")
+    told = ["--policy-from", str(given), "--policy", "shallow"]
+    refused(command(tmp_path / "c", "rgat", ENV, *told), capfd, "--policy", "(4, 64, 64, 1)")
+
+
+def test_tensorboard_on_request(tmp_path, capfd, monkeypatch):
+    scalars = []
+
+    class Board:
+        def add_scalar(self, name, value, x):
+            scalars.append((name, value, x))
+
+    monkeypatch.setattr(train, "tensorboard", lambda folder: Board())
+    told = ["--grounding-steps", "1", "--tensorboard"]
+    assert train.main(command(tmp_path / "run", "sim", ENV, *told)) == 0
+    row = table(tmp_path / "run" / "progress.csv")[1]
+    value = float(row["real_return_deterministic"])
+    assert ("on real/real_return_deterministic", value, 1) in scalars
+    assert any(name == "01 policy/kl" for name, _, _ in scalars)
+
+
+# --- cut off, resumed, extended -----------------------------------------------------------------------
 
 MORE = "--grounding-steps 4".split()
 

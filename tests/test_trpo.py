@@ -523,18 +523,16 @@ def test_collect_equals_a_plain_loop_over_gymnasiums_own_environments():
     np.testing.assert_allclose(last, stock_last, atol=1e-6)
 
 
-def test_a_line_search_takes_no_worse_surrogate():
-    """A surrogate whose best step is far shorter than the trust region allows."""
-    torch.manual_seed(0)
-    policy = GaussianPolicy(1, 1, hidden=(4,), log_std=-3.0)
-    obs = torch.randn(64, 1)
-    action = policy.mean(obs).detach() + 0.05 * torch.randn(64, 1)
-    for max_kl in (0.01, 1.0, 100.0):
-        trial = copy.deepcopy(policy)
-        config = TRPOConfig(max_kl=max_kl, backtracks=40, fisher_every=1)
-        stats = policy_update(trial, obs, action, -(action[:, 0] ** 2), config)
-        if stats["line_search"] == "accepted":
-            assert stats["surrogate_gain"] > 0 and stats["kl"] <= max_kl
+def test_a_line_search_takes_no_worse_surrogate(monkeypatch):
+    """Where the trust region is far wider than the surrogate's hill, and does not stop the search itself."""
+    monkeypatch.setattr(trpo, "gaussian_kl", lambda *a: torch.zeros(()))
+    torch.manual_seed(1)
+    policy, obs = GaussianPolicy(3, 1, (16,)), torch.randn(200, 3)
+    action = policy.act(obs)
+    config = TRPOConfig(max_kl=1e4, backtracks=60, entropy=0.1)
+    stats = policy_update(policy, obs, action, action[:, 0], config)
+    assert stats["line_search"] == "accepted" and 0 < stats["step_size"] < 1
+    assert stats["surrogate_gain"] > 0
 
 
 def test_the_presets_are_the_documented_ones():

@@ -256,10 +256,20 @@ class Run:
         write_whole(self.folder / "progress.png", image.getvalue())
 
 
+def tensorboard(folder):
+    """A writer of TensorBoard's event files. Raises RunError where TensorBoard is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise RunError("--tensorboard needs TensorBoard: pip install tensorboard") from None
+    return SummaryWriter(str(folder))
+
+
 class Bar:
     """Progress on a terminal, train.csv and the figure along the way, and the steps and seconds of each grounding step."""
 
-    def __init__(self, s, run):
+    def __init__(self, s, run, board=None):
+        self.board = board
         self.run, self.seen, self.drawn, self.clock = run, 0, time.monotonic(), time.monotonic()
         self.world = "real" if s.algo == "real" else "sim"
         at_steps = s.at_steps * s.algo.endswith("rgat")
@@ -288,11 +298,18 @@ class Bar:
             self.tqdm.update(new)
             self.tqdm.set_description(f"step {step}, {name}, return {stats['return']:.0f}")
             self.run.log_update(step, name, stats)
+            self.scalars(f"{step:02d} {name}", stats, stats["steps"])
             if time.monotonic() - self.drawn > 20:
                 self.run.flush()
                 self.drawn = time.monotonic()
 
         return on_update
+
+    def scalars(self, group, numbers, x):
+        """Numbers at x for TensorBoard, where it was asked for."""
+        for key, value in numbers.items() if self.board else ():
+            if isinstance(value, (int, float)):
+                self.board.add_scalar(f"{group}/{key}", value, x)
 
     def skip(self, steps, counts=True):
         """Steps that an earlier run has done; counts: they are this run's own, not a reference line's."""

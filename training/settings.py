@@ -140,6 +140,10 @@ class Settings:
     pretrained: str = option(
         "", "folder that keeps policies trained from scratch, for other runs to share"
     )
+    policy_from: str = option(
+        "",
+        "a policy.pt to begin with instead of training one in the raw sim; --pretrain-steps are then its critic's",
+    )
     ane_width: float = option(
         GroundingSettings.ane_width,
         "ane: standard deviation of the action noise, as a part of half the action range",

@@ -1,0 +1,193 @@
+"""reproduce.py: which runs are made, which are skipped, in what order; and the statistics of the claims by hand."""
+
+import itertools
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import reproduce
+from training import claims
+from training.experiments import EXPERIMENTS, Arm, version
+from training.results import KEY, PROGRESS, finished, merge, read, rows_of, write
+from training.settings import Settings
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = dict(env="InvertedPendulum-v4", pretrain_steps=1000, policy_steps=500, grounding_steps=2)
+
+
+def arm(name="rgat", **changes):
+    return Arm("try", name, Settings(**{**TINY, "algo": name, **changes}))
+
+
+def fill(job, steps, value=100.0):
+    """What a run leaves in its folder after `steps` grounding steps."""
+    job.folder.mkdir(parents=True, exist_ok=True)
+    row = {"at_one_step_error": 0.1, **dict.fromkeys(PROGRESS[:4], 0)}
+    rows = [
+        {**dict.fromkeys(PROGRESS, ""), **row, "grounding_step": k, "real_return_deterministic": value + k}
+        for k in range(steps + 1)
+    ]  # fmt: skip
+    claims.write_table(job.folder / "progress.csv", PROGRESS, rows)
+    best = {"grounding_step": steps, "episodes": 4, "real_return_deterministic": value, "se": 1.0}
+    (job.folder / "best.json").write_text(json.dumps(best))
+    (job.folder / "lines.json").write_text('{"trained on real": 200.0}')
+
+
+def test_every_experiment_can_be_asked_of_train(tmp_path):
+    import train
+
+    for arms in EXPERIMENTS.values():
+        assert len({a.name for a in arms}) == len({a.key for a in arms}) == len(arms)
+        for a in arms:
+            job = reproduce.Job(a, 3, None, tmp_path)
+            parsed = vars(train.parse(job.command()))
+            told = {k: parsed[k] for k in vars(a.settings)}
+            told = Settings(**{**told, "pretrained": ""}).completed()
+            assert told == a.of(3)
+
+
+def test_a_row_of_other_settings_or_of_another_version_is_not_taken_for_this_runs(tmp_path):
+    path, now = tmp_path / "rounds.csv", "v1"
+    job = reproduce.Job(arm(), 0, 2, tmp_path / "runs")
+    assert not finished(path, job, now)
+    fill(job, 1)
+    write(path, rows_of(job, now, "abc")[0], [*KEY, *PROGRESS])
+    assert not finished(path, job, now)  # one of two steps
+    fill(job, 2)
+    write(path, merge(path, rows_of(job, now, "abc")[0]), [*KEY, *PROGRESS])
+    assert len(read(path)) == 3 and finished(path, job, now)
+    assert not finished(path, job, "v2")
+    assert not finished(path, reproduce.Job(arm(), 0, 20, tmp_path), now)
+    assert not finished(path, reproduce.Job(arm(), 1, 2, tmp_path), now)
+    other = arm(at_gamma=0.5)
+    assert other.key != arm().key == arm(grounding_steps=7).key == arm(seed=4, threads=2).key
+    assert not finished(path, reproduce.Job(other, 0, 2, tmp_path), now)
+    assert reproduce.Job(other, 0, 2, tmp_path).folder != job.folder
+
+
+def test_a_folder_that_is_there_goes_on_and_is_asked_for_more_steps(tmp_path):
+    job = reproduce.Job(arm(), 0, 20, tmp_path)
+    job.folder.mkdir(parents=True)
+    (job.folder / "config.json").write_text("{}")
+    assert job.command() == ["--resume", str(job.folder), "--grounding-steps", "20"]
+
+
+def test_merged_tables_keep_the_run_that_went_further(tmp_path):
+    tables = []
+    for name, steps in (("a", 1), ("b", 2)):
+        job = reproduce.Job(arm(), 0, 2, tmp_path / name)
+        fill(job, steps, value=10.0 * steps)
+        tables.append(tmp_path / name / "rounds.csv")
+        write(tables[-1], rows_of(job, "v1", "abc")[0], [*KEY, *PROGRESS])
+    for one, other in itertools.permutations(tables):
+        values = [float(row["real_return_deterministic"]) for row in merge(one, other)]
+        assert sorted(values) == [20.0, 21.0, 22.0]
+
+
+def test_one_job_trains_what_others_begin_with_and_none_is_lost(tmp_path, monkeypatch):
+    """Four arms of two seeds, three at a time, each a process that records its begin and end; one of them fails."""
+    jobs = [reproduce.Job(arm(n), seed, 1, tmp_path) for seed in (0, 1) for n in ("rgat", "gat", "sim", "ane")]  # fmt: skip
+    log = tmp_path / "log"
+    log.write_text("")
+
+    def start(job):
+        fill_later = (
+            "import sys, time, pathlib; f = pathlib.Path(sys.argv[1]); f.mkdir(parents=True); log = open(sys.argv[2], 'a')\n"
+            "log.write('begins ' + f.name + chr(10)); log.flush(); time.sleep(0.3); (f / 'progress.csv').write_text('')\n"
+            "log.write('has begun ' + f.name + chr(10)); log.flush(); time.sleep(0.6); sys.exit('-gat-' in f.name and 's1' in f.name)"
+        )
+        job.process = subprocess.Popen([sys.executable, "-c", fill_later, job.folder, log])
+
+    monkeypatch.setattr(reproduce.Job, "start", start)
+    monkeypatch.setattr(reproduce.Job, "said", lambda job: ["no"])
+    monkeypatch.setattr(reproduce.time, "sleep", lambda s, sleep=reproduce.time.sleep: sleep(0.05))
+    kept = []
+    failed = reproduce.run_all(jobs, 3, float("inf"), kept.append)
+    assert sorted(j.folder.name for j in kept) == sorted(j.folder.name for j in jobs)
+    assert [(j.arm.name, j.seed) for j in failed] == [("gat", 1)]
+    for seed in (0, 1):
+        mine = [line for line in log.read_text().splitlines() if line.endswith(f"s{seed}")]
+        assert mine[0].startswith("begins") and mine[1].startswith("has begun")
+
+
+def test_it_stops_in_time_and_says_what_waits(tmp_path, monkeypatch, capsys):
+    def start(job):
+        fill(job, 1)
+        job.process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+
+    monkeypatch.setattr(reproduce.Job, "start", start)
+    monkeypatch.setitem(EXPERIMENTS, "hopper", [arm()])
+    told = ["--experiments", "hopper", "--seeds", "0", "1", "--minutes", "0.02", "--commit", "abc"]
+    folders = ["--runs", str(tmp_path / "runs"), "--results", str(tmp_path)]
+    assert reproduce.main([*told, *folders]) == 1
+    rows = read(tmp_path / "rounds.csv")
+    assert [(r["seed"], r["grounding_step"]) for r in rows] == [("0", "0"), ("0", "1")]
+    assert {r["commit"] for r in rows} == {"abc"} and {r["version"] for r in rows} == {version()}
+    assert "0 of 2 runs" in capsys.readouterr().out
+
+
+def test_a_table_that_is_none_is_told_in_one_line(tmp_path, capsys):
+    (tmp_path / "rounds.csv").write_text("name,value\na,1\n")
+    assert reproduce.main(["--claims", "--results", str(tmp_path)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+# --- the claims ---------------------------------------------------------------------------------------
+
+
+def test_permutation_by_hand():
+    assert claims.permutation_p(np.array([1.0, 2.0, 3.0])) == 1 / 8
+    assert claims.permutation_p(np.array([3.0, -1.0, 2.0])) == 2 / 8
+    assert claims.permutation_p(np.array([-1.0, -2.0])) == 1.0
+    assert claims.permutation_p(np.zeros(5)) == 1.0
+    assert claims.permutation_p(np.ones(10)) == 1 / 1024
+    assert claims.permutation_p(np.ones(20)) < 1e-4
+
+
+def test_holm_by_hand():
+    np.testing.assert_allclose(
+        claims.holm([0.01, 0.04, np.nan, 0.03, 0.005]), [0.03, 0.06, np.nan, 0.06, 0.02]
+    )
+    assert claims.holm([0.9, 0.8]).tolist() == [1.0, 1.0]
+
+
+def test_verdicts():
+    assert claims.verdict(5.0, 0.01, 10) == "holds"
+    assert claims.verdict(5.0, 0.2, 10) == "undecided"
+    assert claims.verdict(-1.0, 1.0, 10) == "does not hold"
+    assert claims.verdict(-1.0, 1.0, 2) == claims.verdict(5.0, 0.01, 2) == "undecided"
+
+
+def row(arm, seed, step, value, v="v1", error=""):
+    told = {"experiment": "hopper", "arm": arm, "seed": seed, "version": v, "commit": "c", "grounding_step": step}  # fmt: skip
+    return {**told, "real_return_deterministic": value, "at_one_step_error": error}
+
+
+def test_pairs_are_of_seeds_that_both_have_over_rounds_that_both_have():
+    rounds = [row("rgat", s, k, 10 * s + k) for s in (0, 1, 2) for k in range(4)]
+    rounds += [row("gat", s, k, 10 * s - k) for s in (1, 2, 3) for k in range(3)]
+    data = claims.Data(rounds, [{"seed": 1, "trained_on_real": 10}])
+    np.testing.assert_allclose(claims.above("rgat", "gat")(data), [3.0, 3.0])  # 2 * mean(1, 2)
+    np.testing.assert_allclose(claims.reaches("rgat")(data), [(13 - 9) / 10])
+    np.testing.assert_allclose(claims.reaches("rgat", 1)(data), [(11 - 9) / 10])
+    np.testing.assert_allclose(claims.falls_short("rgat")(data), [-0.4])
+
+
+def test_versions_are_never_put_together():
+    rounds = [row("rgat", s, 0, 1.0) for s in range(3)] + [row("rgat", s, 0, 5.0, "v2") for s in range(9)]  # fmt: skip
+    judged = [{**row("rgat", 0, 0, 1.0), "trained_on_real": 7.0}]
+    data = claims.by_experiment(rounds, judged)["hopper"]
+    assert data.version == "v2" and len(data.returns["rgat"]) == 9 and not data.lines
+
+
+def test_the_documents_tables_are_the_tables_of_the_csvs():
+    rounds, judged, transformers = (read(ROOT / "results" / f"{n}.csv") for n in ("rounds", "judged", "transformers"))  # fmt: skip
+    made = claims.table(rounds, judged, transformers)
+    kept = read(ROOT / "results" / "claims.csv")
+    assert [{k: str(v) for k, v in r.items()} for r in made] == kept
+    text = claims.DOCS.read_text()
+    assert claims.filled(text, rounds, judged, made) == text
+    assert "<!-- claims -->" in text and "<!-- rounds -->" in text
