@@ -406,8 +406,9 @@ class BatchEnv(VectorEnv):
         batch.warning[:] = 0
         if lost.all():
             raise EnvError(
-                f"{self.env_id}: the simulation became unstable (NaN or huge values) at step {self.steps[0]}, in every "
-                "environment: if --real changed the model, choose a smaller change"
+                f"{self.env_id}: the simulation became unstable (NaN or huge values) at step "
+                f"{self.steps[0]}, in every environment: if --real changed the model, choose a "
+                "smaller change"
             )
         return lost
 
@@ -420,16 +421,10 @@ def _registered(num_envs, env_id, real="", nthread=0):
     return BatchEnv(env_id, num_envs, parse_perturbation(real), nthread=nthread)
 
 
-for _env_id in ENV_IDS:  # on import, as gymnasium asks for it
-    gymnasium.register(
-        f"rgat/{_env_id}", vector_entry_point=_registered, kwargs={"env_id": _env_id}
-    )
-
-
 class SingleEnv(gymnasium.Env):
-    """One robot of a BatchEnv as a gymnasium.Env: gymnasium.make("rgat/Hopper-v5", real="torso:mass*1.27").
+    """One robot of a BatchEnv as a gymnasium.Env: gymnasium.make("rgat/Hopper-v5").
 
-    real: as train.py's --real; "" for the sim.
+    real: a perturbation as parse_perturbation reads it; "" for the sim.
     """
 
     metadata = {"render_modes": []}
@@ -448,15 +443,10 @@ class SingleEnv(gymnasium.Env):
         return info["next_obs"][0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
 
 
-def vector_env(num_envs, env_id, real="", **kwargs):
-    """gymnasium.make_vec("rgat/Hopper-v5", num_envs=32): a BatchEnv."""
-    return BatchEnv(env_id, num_envs, parse_perturbation(real), **kwargs)
-
-
-for _env_id in (name for name in ENV_IDS if f"rgat/{name}" not in gymnasium.registry):
+for _env_id in ENV_IDS:  # on import, as gymnasium asks for it
     gymnasium.register(
         f"rgat/{_env_id}",
         entry_point=SingleEnv,
-        vector_entry_point=vector_env,
+        vector_entry_point=_registered,
         kwargs={"env_id": _env_id},
     )

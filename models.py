@@ -157,7 +157,8 @@ class GaussianPolicy(nn.Module):
     """pi(a|s) = N(mean_theta(s), diag(exp(log_std))^2): an MLP mean and a state-independent log_std.
 
     Args: nobs, nact: widths. hidden: hidden layer widths. log_std: initial value for every action dimension.
-    low, high: the robot's bounds of an action, (nact,), which action() keeps; what is learnt from is unbounded.
+    low, high: the robot's bounds of an action, (nact,), which action() keeps; what is learnt from
+    is unbounded.
     """
 
     def __init__(self, nobs, nact, hidden=DEEP, log_std=0.0, low=-math.inf, high=math.inf):

@@ -114,7 +114,9 @@ def run_all(jobs, width, deadline, keep):
 
 def commit():
     """The commit that the code is of, with + where files differ from it; "" outside a repository."""
-    git = lambda *words: subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True)  # fmt: skip
+    git = lambda *words: subprocess.run(
+        ["git", "-C", str(ROOT), *words], capture_output=True, text=True
+    )
     head = git("rev-parse", "--short=10", "HEAD").stdout.strip()
     changed = git("status", "--porcelain", "--untracked-files=no", "--", "*.py").stdout.strip()
     return head + "+" * bool(changed)
@@ -126,17 +128,29 @@ def parse(argv):
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--experiments", nargs="+", choices=list(EXPERIMENTS), metavar="NAME", help=f"of: {'; '.join(EXPERIMENTS)}")  # fmt: skip
+    parser.add_argument(
+        "--experiments",
+        nargs="+",
+        choices=list(EXPERIMENTS),
+        metavar="NAME",
+        help=f"of: {'; '.join(EXPERIMENTS)}",
+    )
     parser.add_argument("--arms", nargs="+", metavar="NAME", help="only these lines of them")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(10)))
-    parser.add_argument("--grounding-steps", type=int, help="fewer or more than the paper's; a later call can add to them")  # fmt: skip
+    parser.add_argument(
+        "--grounding-steps",
+        type=int,
+        help="fewer or more than the paper's; a later call can add to them",
+    )
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time, a core each")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so long")
     parser.add_argument("--claims", action="store_true", help="run nothing")
     parser.add_argument("--merge", type=Path, metavar="RESULTS", help="take over another's rows")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs")
     parser.add_argument("--results", type=Path, default=ROOT / "results")
-    parser.add_argument("--commit", default=None, help="name of the code, where there is no repository")  # fmt: skip
+    parser.add_argument(
+        "--commit", default=None, help="name of the code, where there is no repository"
+    )
     return parser.parse_args(argv)
 
 
@@ -158,7 +172,11 @@ def main(argv=None):
             ]
             name, now = args.commit or commit(), version()
             # seed by seed, so that whenever it stops every arm has the same seeds
-            jobs = [Job(arm, seed, args.grounding_steps, args.runs / now) for seed in args.seeds for arm in arms]  # fmt: skip
+            jobs = [
+                Job(arm, seed, args.grounding_steps, args.runs / now)
+                for seed in args.seeds
+                for arm in arms
+            ]
             todo = [job for job in jobs if not finished(tables[0], job, now)]
 
             def keep(job):

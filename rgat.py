@@ -11,7 +11,9 @@ is one class with the same two steps.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import mujoco
 import numpy as np
 import torch
 from gymnasium.spaces import Box
@@ -19,8 +21,15 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch
 
-from envs import EnvError
-from models import ForwardModel, GaussianPolicy, InverseModel, Regressor, Value
+from envs import BatchEnv, EnvError
+from models import (
+    ForwardModel,
+    GaussianPolicy,
+    InverseModel,
+    Regressor,
+    Value,
+    load_checkpoint,
+)
 from trpo import TRPO, TRPOConfig, rollouts
 
 # the action transformer's own trust region, entropy and discount; section IV-D has 1e-4, 1e-5 and 0.99 (see README)
@@ -44,22 +53,10 @@ class GroundedEnv(VectorWrapper):
         return self.obs.copy(), info
 
     def step(self, actions, applied=None):
-        """As BatchEnv.step; applied: what a transformer in front of this one made of the actions."""
+        """As BatchEnv.step; applied: what a transformer before this one made of the actions."""
         a_hat = self.transformer(self.obs, actions if applied is None else applied)
         self.obs, *rest = self.env.step(actions, applied=a_hat)
         return self.obs.copy(), *rest
-
-
-def grounded_env(run, num_envs=1, step=None):
-    """The grounded simulator of a finished run, RGAT's product: a gymnasium vector environment to train any policy in.
-
-    run: the run's folder. step: the grounding step whose simulator it is, the last by default.
-    Raises training.run_folder.RunError for a folder that holds no such step.
-    """
-    from train import loaded_grounding
-
-    grounding = loaded_grounding(run, num_envs, step)
-    return GroundedEnv(grounding.sim, grounding.transformer)
 
 
 class RealModel:
@@ -523,6 +520,29 @@ METHODS = {
     "sim": Grounding,
     "real": Grounding,
 }
+
+
+def grounded_env(run, num_envs=1, step=None):
+    """The grounded simulator of a finished run, RGAT's product: a gymnasium vector environment to
+    train any policy in.
+
+    run: the run's folder. step: the grounding step that it is of, the last one by default.
+    Raises EnvError for a folder without that step, and for a run of the oracle.
+    """
+    steps = sorted(Path(run).glob("step_*.pt"))[1:]
+    if not 0 < (len(steps) if step is None else step) <= len(steps):
+        raise EnvError(f"{run} has no grounding step {step or 1}: it has done {len(steps)}")
+    saved = load_checkpoint(steps[-1 if step is None else step - 1])
+    world, state = saved["world"], saved["grounding"]
+    xml, state = state.get("corrected_xml"), state.get("rest", state)
+    model = mujoco.MjModel.from_xml_string(xml) if xml else None
+    sim = BatchEnv(world["env"], num_envs, model=model)
+    method = METHODS.get(world["algo"].removeprefix("physics+"), Grounding)
+    if method is Oracle:
+        raise EnvError(f"{run}: an oracle's simulator cannot be had without the real one")
+    grounding = method(sim, GroundingSettings(**world["settings"]))
+    grounding.load(state)
+    return GroundedEnv(sim, grounding.transformer)
 
 
 def step_size(transitions):

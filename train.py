@@ -141,13 +141,23 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
     transformer = grounding.state() if step else {}
     run.record(
         row,
-        {"learner": learner.state(), "grounding": transformer, "acting": acting},
+        {
+            "learner": learner.state(),
+            "grounding": transformer,
+            "acting": acting,
+            "world": {"env": s.env, "algo": s.algo, "settings": transforming(s.grounding)},
+        },
         tau_new,
     )
     bar.scalars("on real", row, step)
     bar.say(
         f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real"
     )
+
+
+def transforming(settings):
+    """What a saved transformer has to be told again, as a dict; how it was trained it need not."""
+    return {k: v for k, v in vars(settings).items() if k != "at"}
 
 
 def roll_back(s, run, learner, reached):
@@ -204,24 +214,6 @@ def start(s, run, sim, real, bar):
     reference(s, run, learner, real, bar)
     record(s, run, 0, learner, grounding, real, tau_real, {}, bar)
     return learner, grounding, tau_real
-
-
-def loaded_grounding(folder, num_envs, step=None):
-    """The Grounding that a run's grounding step left (the last one by default), in num_envs simulations."""
-    run, saved = Run.open(folder)
-    s, done = settings_of(folder, saved), len(run.progress) - 1
-    step = done if step is None else step
-    if not 1 <= step <= done:
-        raise RunError(f"{folder} has no grounding step {step}: it has done {max(done, 0)}")
-    sim = BatchEnv(s.env, num_envs)
-    real = BatchEnv(s.env, 1, parse_perturbation(s.real))
-    told = (real.model,) if s.algo == "oracle" else ()
-    grounding = GROUNDINGS[s.algo](sim, s.grounding, *told)
-    try:
-        grounding.load(run.checkpoint(step)["grounding"])
-    except UNSOUND:
-        raise RunError(f"{folder}/step_{step:02d}.pt does not belong to this run") from None
-    return grounding
 
 
 def reference(s, run, learner, real, bar):

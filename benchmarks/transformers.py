@@ -60,16 +60,21 @@ def measure(seed, name):
                     held_out.a[pick, 0],
                 )
                 key = {"seed": seed, "world": world, "forward_model": model, "algo": algo}
-                rows.append({
-                    **key,
-                    "rms_from_identity": f"{np.sqrt(np.mean((a_hat - a) ** 2)):.5f}",
-                    "slope": f"{np.polyfit(a, a_hat, 1)[0]:.5f}",
-                    "one_step_error": f"{one_step_error(sim, grounding.transformer, held_out)[0]:.5f}",
-                    "version": version(),
-                    "commit": name,
-                })  # fmt: skip
+                rows.append(
+                    {
+                        **key,
+                        "rms_from_identity": f"{np.sqrt(np.mean((a_hat - a) ** 2)):.5f}",
+                        "slope": f"{np.polyfit(a, a_hat, 1)[0]:.5f}",
+                        "one_step_error": f"{one_step_error(sim, grounding.transformer, held_out)[0]:.5f}",
+                        "version": version(),
+                        "commit": name,
+                    }
+                )
                 print(*rows[-1].values(), flush=True)
-                points += [{**key, "a": f"{x:.4f}", "a_hat": f"{y:.4f}"} for x, y in zip(a[::4], a_hat[::4])]  # fmt: skip
+                points += [
+                    {**key, "a": f"{x:.4f}", "a_hat": f"{y:.4f}"}
+                    for x, y in zip(a[::4], a_hat[::4])
+                ]
     return rows, points
 
 
@@ -98,7 +103,11 @@ def draw():
         panel.plot([-3, 3], [-3, 3], color="black", lw=1)
         title = []
         for model, color in (("plain", "#d98b1f"), ("residual", "#1f5fa8")):
-            mine = lambda table: [r for r in table if (r["algo"], r["world"], r["forward_model"]) == (algo, world, model)]  # fmt: skip
+            mine = lambda table: [
+                r
+                for r in table
+                if (r["algo"], r["world"], r["forward_model"]) == (algo, world, model)
+            ]
             xy = np.array([(float(r["a"]), float(r["a_hat"])) for r in mine(points)])
             panel.scatter(*xy.T, s=4, alpha=0.4, color=color, lw=0)
             rms = np.mean([float(r["rms_from_identity"]) for r in mine(rows)])

@@ -152,12 +152,19 @@ def test_g_phi_gets_its_steps_and_is_judged_on_what_nothing_is_fitted_on(spied):
         (AT, seed(1, "transformer")),
         (AT, seed(2, "transformer")),
     ]
-    held_out = [k for k, e in enumerate(log) if e[0] == "rollouts" and e[3] in (seed(1, "held out"), seed(2, "held out"))]  # fmt: skip
+    held_out = [
+        k
+        for k, e in enumerate(log)
+        if e[0] == "rollouts" and e[3] in (seed(1, "held out"), seed(2, "held out"))
+    ]
     errors = of(log, "error")
     for step, k in enumerate(held_out):
         transformer = of(log, "update")[step][-1]
         rows = [float(k)] * EPISODES
-        assert errors[2 * step : 2 * step + 2] == [("sim", transformer, rows), ("sim", identity, rows)]  # fmt: skip
+        assert errors[2 * step : 2 * step + 2] == [
+            ("sim", transformer, rows),
+            ("sim", identity, rows),
+        ]
 
 
 def test_seeds_differ_between_uses_steps_and_runs():

@@ -1,4 +1,4 @@
-"""reproduce.py: which runs are made, which are skipped, in what order; and the statistics of the claims by hand."""
+"""reproduce.py: which runs are made and in what order; the statistics of the claims by hand."""
 
 import itertools
 import json
@@ -27,9 +27,14 @@ def fill(job, steps, value=100.0):
     job.folder.mkdir(parents=True, exist_ok=True)
     row = {"at_one_step_error": 0.1, **dict.fromkeys(PROGRESS[:4], 0)}
     rows = [
-        {**dict.fromkeys(PROGRESS, ""), **row, "grounding_step": k, "real_return_deterministic": value + k}
+        {
+            **dict.fromkeys(PROGRESS, ""),
+            **row,
+            "grounding_step": k,
+            "real_return_deterministic": value + k,
+        }
         for k in range(steps + 1)
-    ]  # fmt: skip
+    ]
     claims.write_table(job.folder / "progress.csv", PROGRESS, rows)
     best = {"grounding_step": steps, "episodes": 4, "real_return_deterministic": value, "se": 1.0}
     (job.folder / "best.json").write_text(json.dumps(best))
@@ -88,17 +93,26 @@ def test_merged_tables_keep_the_run_that_went_further(tmp_path):
 
 
 def test_one_job_trains_what_others_begin_with_and_none_is_lost(tmp_path, monkeypatch):
-    """Four arms of two seeds, three at a time, each a process that records its begin and end; one of them fails."""
-    jobs = [reproduce.Job(arm(n), seed, 1, tmp_path) for seed in (0, 1) for n in ("rgat", "gat", "sim", "ane")]  # fmt: skip
+    """Four arms of two seeds, three at a time; each records its begin and end; one fails."""
+    jobs = [
+        reproduce.Job(arm(n), seed, 1, tmp_path)
+        for seed in (0, 1)
+        for n in ("rgat", "gat", "sim", "ane")
+    ]
     log = tmp_path / "log"
     log.write_text("")
 
     def start(job):
-        fill_later = (
-            "import sys, time, pathlib; f = pathlib.Path(sys.argv[1]); f.mkdir(parents=True); log = open(sys.argv[2], 'a')\n"
-            "log.write('begins ' + f.name + chr(10)); log.flush(); time.sleep(0.3); (f / 'progress.csv').write_text('')\n"
-            "log.write('has begun ' + f.name + chr(10)); log.flush(); time.sleep(0.6); sys.exit('-gat-' in f.name and 's1' in f.name)"
-        )
+        fill_later = """if True:
+            import sys, time, pathlib
+            folder, log = pathlib.Path(sys.argv[1]), open(sys.argv[2], "a", buffering=1)
+            folder.mkdir(parents=True)
+            print("begins", folder.name, file=log)
+            time.sleep(0.3)
+            (folder / "progress.csv").write_text("")
+            print("has begun", folder.name, file=log)
+            time.sleep(0.6)
+            sys.exit("-gat-" in folder.name and "s1" in folder.name)"""
         job.process = subprocess.Popen([sys.executable, "-c", fill_later, job.folder, log])
 
     monkeypatch.setattr(reproduce.Job, "start", start)
@@ -135,7 +149,7 @@ def test_a_table_that_is_none_is_told_in_one_line(tmp_path, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-# --- the claims ---------------------------------------------------------------------------------------
+# --- the claims -----------------------------------------------------------------------------------
 
 
 def test_permutation_by_hand():
@@ -162,7 +176,14 @@ def test_verdicts():
 
 
 def row(arm, seed, step, value, v="v1", error=""):
-    told = {"experiment": "hopper", "arm": arm, "seed": seed, "version": v, "commit": "c", "grounding_step": step}  # fmt: skip
+    told = {
+        "experiment": "hopper",
+        "arm": arm,
+        "seed": seed,
+        "version": v,
+        "commit": "c",
+        "grounding_step": step,
+    }
     return {**told, "real_return_deterministic": value, "at_one_step_error": error}
 
 
@@ -177,14 +198,18 @@ def test_pairs_are_of_seeds_that_both_have_over_rounds_that_both_have():
 
 
 def test_versions_are_never_put_together():
-    rounds = [row("rgat", s, 0, 1.0) for s in range(3)] + [row("rgat", s, 0, 5.0, "v2") for s in range(9)]  # fmt: skip
+    rounds = [row("rgat", s, 0, 1.0) for s in range(3)] + [
+        row("rgat", s, 0, 5.0, "v2") for s in range(9)
+    ]
     judged = [{**row("rgat", 0, 0, 1.0), "trained_on_real": 7.0}]
     data = claims.by_experiment(rounds, judged)["hopper"]
     assert data.version == "v2" and len(data.returns["rgat"]) == 9 and not data.lines
 
 
 def test_the_documents_tables_are_the_tables_of_the_csvs():
-    rounds, judged, transformers = (read(ROOT / "results" / f"{n}.csv") for n in ("rounds", "judged", "transformers"))  # fmt: skip
+    rounds, judged, transformers = (
+        read(ROOT / "results" / f"{n}.csv") for n in ("rounds", "judged", "transformers")
+    )
     made = claims.table(rounds, judged, transformers)
     kept = read(ROOT / "results" / "claims.csv")
     assert [{k: str(v) for k, v in r.items()} for r in made] == kept

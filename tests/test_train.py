@@ -16,7 +16,7 @@ ROOT = str(Path(__file__).resolve().parents[1])
 import rgat
 import train
 import trpo
-from envs import BatchEnv
+from envs import BatchEnv, EnvError
 from models import GaussianPolicy
 from rgat import GroundedEnv
 from training import run_folder
@@ -99,7 +99,7 @@ def finished(tmp_path_factory):
     return make
 
 
-# --- end to end ---------------------------------------------------------------------------------------
+# --- end to end -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("algo", [algo for algo in ALGOS if "+" not in algo])
@@ -208,7 +208,7 @@ def test_pretrained_policies_are_shared(tmp_path, monkeypatch, finished):
     assert {"pretrain", "reference"} <= set(phases)
 
 
-# --- cut off and resumed ------------------------------------------------------------------------------
+# --- cut off and resumed --------------------------------------------------------------------------
 
 
 class Killed(BaseException):
@@ -257,7 +257,7 @@ def test_a_kill_while_writing_loses_nothing_that_was_whole(write, tmp_path, fini
     assert_same_run(folder, finished("rgat"))
 
 
-# --- what a run leaves to others ----------------------------------------------------------------------
+# --- what a run leaves to others ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("algo", ["rgat", "gat", "ane", "solved", "sim"])
@@ -292,7 +292,7 @@ def test_sb3_trains_in_a_runs_grounded_simulator(finished):
 
 def test_a_run_without_that_grounding_step_is_named(finished, tmp_path):
     for folder, step in ((finished("rgat"), 3), (finished("rgat"), 0), (tmp_path, None)):
-        with pytest.raises(run_folder.RunError, match=str(folder)):
+        with pytest.raises(EnvError, match=str(folder)):
             rgat.grounded_env(folder, step=step)
 
 
@@ -337,7 +337,7 @@ def test_tensorboard_on_request(tmp_path, capfd, monkeypatch):
     assert any(name == "01 policy/kl" for name, _, _ in scalars)
 
 
-# --- cut off, resumed, extended -----------------------------------------------------------------------
+# --- cut off, resumed, extended -------------------------------------------------------------------
 
 MORE = "--grounding-steps 4".split()
 
@@ -437,7 +437,7 @@ def test_resuming_a_finished_run_changes_nothing(tmp_path, finished):
     assert contents(folder) == before
 
 
-# --- bad input ----------------------------------------------------------------------------------------
+# --- bad input ------------------------------------------------------------------------------------
 
 
 def refused(argv, capfd, *says):
@@ -645,7 +645,7 @@ def test_help_has_a_line_for_each_setting(capsys):
         assert f"--{name} " in text
 
 
-# --- replay -------------------------------------------------------------------------------------------
+# --- replay ---------------------------------------------------------------------------------------
 
 
 def test_replay_draws_sim_and_real_side_by_side(tmp_path, finished, capsys):

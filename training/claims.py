@@ -17,7 +17,7 @@ from scipy import stats
 
 from diagnosis.common.atomic_files import write_table, write_whole
 from training.experiments import WIDTHS
-from training.results import read
+from training.results import SAME, read
 
 COLUMNS = "claim figure statistic value low high seeds p p_corrected verdict choice version commit".split()
 COLORS = {"rgat": "#1f5fa8", "gat": "#d98b1f", "sim": "#c0392b", "real": "#2e8b57", "oracle": "#555555", "solved": "#0f8b8d", "rgat as printed": "#111111", "rgat, rolled back": "#7fb0e0"}  # fmt: skip
@@ -63,8 +63,11 @@ class Data:
 
 
 def by_experiment(rounds, judged):
-    """{experiment: Data}, of each experiment the version with the most runs."""
+    """{experiment: Data} of the runs that have ended, of each the version with the most runs."""
     found = {}
+    run = lambda row: tuple(str(row[k]) for k in SAME)
+    ended = {run(row) for row in judged}
+    rounds = [row for row in rounds if run(row) in ended]
     for name in sorted({row["experiment"] for row in rounds}):
         mine = [row for row in rounds if row["experiment"] == name]
         runs = defaultdict(set)

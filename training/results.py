@@ -9,7 +9,15 @@ from training.run_folder import PROGRESS
 
 KEY = "experiment arm env policy algo settings version commit seed".split()
 ROUNDS = [*KEY, *PROGRESS]
-JUDGED = [*KEY, "grounding_step", "episodes", "real_return_deterministic", "se", "before_grounding", "trained_on_real"]  # fmt: skip
+JUDGED = [
+    *KEY,
+    "grounding_step",
+    "episodes",
+    "real_return_deterministic",
+    "se",
+    "before_grounding",
+    "trained_on_real",
+]
 SAME = "experiment arm settings version seed".split()  # what makes two rows rows of one run
 
 
@@ -25,7 +33,13 @@ def read(path):
 def write(path, rows, columns):
     """Write rows whole, in an order of their own."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    order = lambda row: (row["experiment"], row["arm"], row["version"], int(row["seed"]), int(row["grounding_step"]))  # fmt: skip
+    order = lambda row: (
+        row["experiment"],
+        row["arm"],
+        row["version"],
+        int(row["seed"]),
+        int(row["grounding_step"]),
+    )
     write_table(path, columns, sorted(rows, key=order))
 
 
@@ -44,7 +58,13 @@ def merge(path, others):
 
 def finished(path, job, version):
     """Whether a CSV holds every grounding step of a job."""
-    key = {"experiment": job.arm.experiment, "arm": job.arm.name, "settings": job.arm.key, "version": version, "seed": str(job.seed)}  # fmt: skip
+    key = {
+        "experiment": job.arm.experiment,
+        "arm": job.arm.name,
+        "settings": job.arm.key,
+        "version": version,
+        "seed": str(job.seed),
+    }
     mine = [row for row in read(path) if all(row[k] == v for k, v in key.items())]
     return any(int(row["grounding_step"]) >= job.steps for row in mine)
 
@@ -52,12 +72,34 @@ def finished(path, job, version):
 def rows_of(job, version, commit):
     """What a job's folder holds: rows for rounds.csv, and for judged.csv where the run has ended."""
     s = job.settings
-    key = dict(zip(KEY, (job.arm.experiment, job.arm.name, s.env, s.policy, s.algo, job.arm.key, version, commit, str(job.seed))))  # fmt: skip
+    key = dict(
+        zip(
+            KEY,
+            (
+                job.arm.experiment,
+                job.arm.name,
+                s.env,
+                s.policy,
+                s.algo,
+                job.arm.key,
+                version,
+                commit,
+                str(job.seed),
+            ),
+        )
+    )
     rounds = [{**key, **row} for row in read(job.folder / "progress.csv")]
     try:
-        best, lines = (json.loads((job.folder / n).read_text()) for n in ("best.json", "lines.json"))  # fmt: skip
+        best, lines = (
+            json.loads((job.folder / n).read_text()) for n in ("best.json", "lines.json")
+        )
     except FileNotFoundError:
         return rounds, []
     before = rounds[0]["real_return_deterministic"]
-    judged = {**key, **best, "before_grounding": before, "trained_on_real": lines["trained on real"]}  # fmt: skip
+    judged = {
+        **key,
+        **best,
+        "before_grounding": before,
+        "trained_on_real": lines["trained on real"],
+    }
     return rounds, [{k: judged[k] for k in JUDGED}]
