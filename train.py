@@ -249,8 +249,8 @@ def take_over(s, learner, world, bar):
         raise RunError(f"--policy-from: {error}") from None
     if policy.sizes != learner.policy.sizes:
         raise RunError(
-            f"--policy-from {s.policy_from} has layers of {policy.sizes}, --env {s.env} and --policy {s.policy} "
-            f"make {learner.policy.sizes}"
+            f"--policy-from {s.policy_from} has layers of {policy.sizes}, --env {s.env} and "
+            f"--policy {s.policy} make {learner.policy.sizes}"
         )
     learner.policy.load_state_dict(policy.state_dict())
     learner.value.normalizer.load_state_dict(policy.normalizer.state_dict())

@@ -267,9 +267,10 @@ class TRPO:
     def learn(self, env, steps, seed, freeze_normalizer=True, on_update=None, critic_alone=False):
         """Train on env for at least `steps` transitions, in whole batches; seed decides every random number.
 
-        freeze_normalizer: keep the observation statistics as they are. critic_alone: keep the policy, which came without a
-        critic: an improvement by one that knows nothing yet would ruin it. on_update(stats) is called with a dict after
-        every update of the policy; the value may then still be fitting, and stands still once learn returns.
+        freeze_normalizer: keep the observation statistics as they are. critic_alone: keep the
+        policy, which came without a critic: an improvement by one that knows nothing yet would ruin
+        it. on_update(stats) is called with a dict after every update of the policy; the value may
+        then still be fitting, and stands still once learn returns.
         """
         as_vector(self.policy)
         tie(self.optimizer, self.value.net)

@@ -178,6 +178,7 @@ def test_verdicts():
 def row(arm, seed, step, value, v="v1", error=""):
     told = {
         "experiment": "hopper",
+        "settings": "s",
         "arm": arm,
         "seed": seed,
         "version": v,
@@ -201,9 +202,12 @@ def test_versions_are_never_put_together():
     rounds = [row("rgat", s, 0, 1.0) for s in range(3)] + [
         row("rgat", s, 0, 5.0, "v2") for s in range(9)
     ]
-    judged = [{**row("rgat", 0, 0, 1.0), "trained_on_real": 7.0}]
-    data = claims.by_experiment(rounds, judged)["hopper"]
-    assert data.version == "v2" and len(data.returns["rgat"]) == 9 and not data.lines
+    ended = [{**r, "trained_on_real": 7.0 + (r["version"] == "v2")} for r in rounds]
+    data = claims.by_experiment(rounds, ended)["hopper"]
+    assert data.version == "v2" and len(data.returns["rgat"]) == 9
+    assert set(data.lines.values()) == {8.0}
+    data = claims.by_experiment(rounds, ended[:4])["hopper"]  # what has not ended does not count
+    assert data.version == "v1" and len(data.returns["rgat"]) == 3
 
 
 def test_the_documents_tables_are_the_tables_of_the_csvs():

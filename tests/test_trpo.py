@@ -524,7 +524,7 @@ def test_collect_equals_a_plain_loop_over_gymnasiums_own_environments():
 
 
 def test_a_line_search_takes_no_worse_surrogate(monkeypatch):
-    """Where the trust region is far wider than the surrogate's hill, and does not stop the search itself."""
+    """The trust region is far wider than the surrogate's hill, and stops nothing."""
     monkeypatch.setattr(trpo, "gaussian_kl", lambda *a: torch.zeros(()))
     torch.manual_seed(1)
     policy, obs = GaussianPolicy(3, 1, (16,)), torch.randn(200, 3)

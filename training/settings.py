@@ -142,7 +142,8 @@ class Settings:
     )
     policy_from: str = option(
         "",
-        "a policy.pt to begin with instead of training one in the raw sim; --pretrain-steps are then its critic's",
+        "a policy.pt to begin with instead of training one in the raw sim; --pretrain-steps are "
+        "then its critic's",
     )
     ane_width: float = option(
         GroundingSettings.ane_width,
