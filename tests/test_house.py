@@ -13,7 +13,7 @@ COLUMNS, LINES = 100, 50
 # Rooms from the ground up. A room may import from those above it in this list, and from itself.
 FLOORS = (
     ("diagnosis.common", "models", "envs"),
-    ("diagnosis.effects", "trpo"),
+    ("diagnosis.effects", "diagnosis.demo", "trpo"),
     ("diagnosis.recordings", "rgat"),
     ("diagnosis.simulation", "diagnosis.trials"),
     ("diagnosis.estimation",),
