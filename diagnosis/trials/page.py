@@ -19,6 +19,20 @@ WORSE = 1.01  # times the nominal error: predicts worse
 CLOSE = 1.1  # times the true model's error: as good as it
 STRONG = 3.0  # times the noise
 SIZES = (0.0, 3.0, 10.0, 30.0, 100.0, math.inf)
+GOALS = {
+    "strict success, something hidden": "≥ 85 %",
+    "one effect > 3 × noise: named, or in a class of ≤ 3": "≥ 95 %",
+    "two effects: both": "≥ 90 %",
+    "three or four effects: all": "≥ 75 %",
+    "95 % intervals that hold the truth": "93–97 %",
+    "nothing hidden: a false claim": "≤ 2 %",
+    "any trial: a false claim": "≤ 3 %",
+    "a law without a name: unknown, place, variable": "≥ 85 %",
+    "… a confident wrong name": "≤ 3 %",
+    "held-out error above the nominal model's": "none",
+    "within 1.1 of the true model's, something hidden": "≥ 90 %",
+    "processor seconds, mean": "≤ 15",
+}
 ROBOTS = ((1, 1), (2, 3), (4, 6), (7, 12))
 
 
@@ -117,7 +131,7 @@ def rate(results, test):
 
 
 def rates(results):
-    """[(group, what is asked, Rate or text)] of one tool's results."""
+    """[(group, what is asked, Rate or text)] of one tool's results; GOALS has what is aimed at."""
     kind = lambda *names: [r for r in results if r.kind in names and r.needed == expected(r)]
     nulls = [r for r in results if r.kind == "null"]
     hidden = [r for r in results if r.needed]
@@ -177,11 +191,13 @@ def class_size(results):
 
 
 def headline(tables):
-    """Lines of text: every rate, a column for each tool."""
+    """Lines of a Markdown table: every rate, a column for each tool."""
     columns = [rates([parse(row) for row in rows]) for rows in tables.values()]
-    lines = [f"{'':56s}" + "".join(f"{name[:26]:>28s}" for name in tables)]
+    line = lambda cells: "| " + " | ".join(map(str, cells)) + " |"
+    lines = [line(["", "goal", *tables]), "|---" * (len(tables) + 2) + "|"]
     for cells in zip(*columns):
-        lines.append(f"{cells[0][1]:56s}" + "".join(f"{str(cell[2]):>28s}" for cell in cells))
+        asked = cells[0][1]
+        lines.append(line([asked, GOALS.get(asked, ""), *(cell[2] for cell in cells)]))
     return lines
 
 
@@ -290,13 +306,15 @@ def write(tables, out):
     columns = [rates(results) for results in parsed.values()]
     first = next(iter(tables.values()))
     versions = sorted({row["version"][:12] or "development" for row in first})
-    lines = [(c[0][0], c[0][1], *(cell[2] for cell in c)) for c in zip(*columns)]
+    lines = [
+        (c[0][0], c[0][1], GOALS.get(c[0][1], ""), *(cell[2] for cell in c)) for c in zip(*columns)
+    ]
     body = [
         "<h1>Hidden physics: the benchmark</h1>",
         f"<p>{len(first)} trials, settings “{html.escape(first[0]['settings'])}”, "
         f"version {html.escape(', '.join(versions))}. Hits over trials with 95 % Wilson "
         "intervals. docs/validation.md has the rules.</p>",
-        _table(("", "rate", *parsed), lines),
+        _table(("", "rate", "goal", *parsed), lines),
     ]
     header = ("by", "", "strict success", "named", "false claim", "predicts worse")
     for name, results in parsed.items():
