@@ -39,7 +39,8 @@ class Run:
     """One recording. time (T,), ctrl (T, nu), qpos (T, nq), qvel (T, nv; NaN where not measured).
 
     true_qpos, true_qvel: what noiseless sensors of the same machine read; states: snapshots of the
-    system per row; stamps: when the rows truly were; touched: share of the time with a contact.
+    system per row; stamps: when the rows truly were; touched: share of the time with a contact;
+    sent: per row but the last, [(control (nu,), seconds)] until the next, rows left out and all.
     """
 
     time: np.ndarray
@@ -52,6 +53,7 @@ class Run:
     states: list = field(repr=False)
     number: int = 0
     touched: float = 0.0
+    sent: list = field(default_factory=list, repr=False)
 
 
 def channel_noise(robot, noise):
@@ -138,6 +140,9 @@ def record(system, plan, rng, number=0, states=True):
     if plan.missing:
         keep[1:-1] = rng.random(len(time) - 2) >= plan.missing
     pick = lambda values: np.array(values)[keep]
+    rows = np.flatnonzero(keep)
+    gaps = np.diff(stamps)
+    sent = [[(ctrl[k], gaps[k]) for k in range(a, b)] for a, b in zip(rows, rows[1:])]
     return Run(
         time=time[keep],
         ctrl=pick(ctrl).reshape(keep.sum(), len(robot.actuators)),
@@ -149,6 +154,7 @@ def record(system, plan, rng, number=0, states=True):
         states=[s for s, k in zip(snaps, keep) if k],
         number=number,
         touched=system.touched / max(system.steps, 1),
+        sent=sent,
     )
 
 

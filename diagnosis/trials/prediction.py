@@ -131,7 +131,8 @@ def system_residuals(system, runs, noise, perfect=False, kept=None, horizon=HORI
                 wanted = run.qpos[first], start_velocity(model, run, first)
             move_reading(system, *wanted)
             for row in range(first, last):
-                system.advance(run.ctrl[row], run.stamps[row + 1] - run.stamps[row])
+                for ctrl, seconds in run.sent[row]:
+                    system.advance(ctrl, seconds)
                 goal = run.true_qpos if perfect else run.qpos
                 out.append(difference(model, goal[row + 1], system.reading()[0]) / noise)
     return np.array(out).reshape(-1, model.nv)

@@ -8,7 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from diagnosis.trials import laws as L
-from diagnosis.trials.prediction import windows
+from diagnosis.trials.experiment import Plan, record
+from diagnosis.trials.prediction import system_error, windows
 from diagnosis.trials.robots import DEVELOPMENT, FINAL, Actuator, Link, Robot, draw_robot, to_mjcf
 from diagnosis.trials.truth import TrueSystem, dry_friction
 
@@ -212,6 +213,17 @@ def test_a_snapshot_brings_back_everything():
     system.restore(kept)
     again = [system.advance(np.array([k]), 0.01) or system.reading()[0][0] for k in range(20)]
     assert first == again
+
+
+def test_the_true_system_repeats_its_recording_through_rows_left_out_and_wrong_stamps():
+    robot = pendulum(frictionloss=0.1, range=(-0.4, 0.4))
+    motor = replace(robot.actuators[0], kp=20.0, kv=2.0)
+    robot = replace(robot, actuators=(motor,))
+    plan = Plan(0.01, "brisk", "closed", 1e-3, "white", "none", "jitter", 0.2, 1.5)
+    system = TrueSystem(robot, [L.FluidMemory(0, damping=0.3, seconds=0.2)])
+    run = record(system, plan, np.random.default_rng(0))
+    assert len(run.time) < 140 and run.touched > 0
+    assert system_error(system, [run], np.array([1e-3]), perfect=True) < 1e-9
 
 
 def test_a_delay_is_kept_to_the_substep():
