@@ -11,7 +11,7 @@ PAGES += sorted((ROOT / "docs").glob("*.md"))
 WORDS = 25  # of a sentence
 SHORT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")]
 SHORT += [ROOT / "docs" / f"{name}.md" for name in ("index", "diagnosis-json", "limits")]
-LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+LINK = re.compile(r"(?:\]\(|<img src=\")([^)\"\s]+)")
 
 
 def prose(page):
