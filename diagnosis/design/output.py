@@ -1,35 +1,28 @@
 """next.csv and next.png: an excitation to record, and what it is expected to show."""
 
+import importlib.util
 import io
 import os
 
-import matplotlib
 import numpy as np
 
 from diagnosis.common.atomic_files import write_together
 from diagnosis.design.explanations import Open, single
 from diagnosis.design.optimal import Excitation, design
 
-matplotlib.use("Agg")
-from matplotlib import pyplot  # noqa: E402
-
 
 def write_next(folder: str, seconds: float) -> str:
-    """Design the next recording of a report's folder, write next.csv and next.png there; what to
-    say of them.
-
-    Raises DesignError, WriteError.
-    """
+    """Design the next recording of a report's folder, write next.csv and, where matplotlib is
+    installed, next.png there; what to say of them. Raises DesignError, WriteError."""
     left = Open.read(folder)
     best = design(left, seconds)
-    model = left.world.model
-    write_together(
-        {
-            os.path.join(folder, "next.csv"): table(best, model),
-            os.path.join(folder, "next.png"): picture(best, model),
-        }
-    )
-    return words(best, folder)
+    files = {"next.csv": table(best, left.world.model)}
+    if importlib.util.find_spec("matplotlib"):
+        files["next.png"] = picture(best, left.world.model)
+    write_together({os.path.join(folder, name): data for name, data in files.items()})
+    drawn = os.path.join(folder, "next.png")
+    drawn = drawn if "next.png" in files else "a picture needs the extra [next], matplotlib"
+    return words(best, os.path.join(folder, "next.csv"), drawn)
 
 
 def table(best: Excitation, model) -> str:
@@ -47,9 +40,8 @@ def ratio(nats: float) -> str:
     return "over a billion to one" if nats > 9 * np.log(10) else f"{np.exp(nats):.2g} to one"
 
 
-def words(best: Excitation, folder: str) -> str:
+def words(best: Excitation, file: str, drawn: str) -> str:
     """What to do, and what is expected of it."""
-    file, drawn = (os.path.join(folder, name) for name in ("next.csv", "next.png"))
     lines = [
         f"Record this next: {best.time[-1] + best.time[1]:.3g} s of controls in {file}, started at "
         "rest in the model's reference pose."
@@ -67,6 +59,11 @@ def words(best: Excitation, folder: str) -> str:
 
 def picture(best: Excitation, model) -> bytes:
     """A PNG of the controls and of the motion under each explanation."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
     joints = single(model)
     panels = model.nu + len(joints)
     figure, axes = pyplot.subplots(
