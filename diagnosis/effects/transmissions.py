@@ -190,15 +190,16 @@ class JointElasticity(Backlash):
 
     name, simplicity, amplitudes, related = "joint_elasticity", 3, 0, ("delay", "lag", "backlash")
 
-    def _inertias(self, model, i):
-        """Of the motor's side, and of both sides swinging against each other."""
+    def _reduced(self, model, i):
+        """Inertia of motor and link swinging against each other."""
         whole = self.scale(model, i)
         motor = max(model.dof_armature[model.jnt_dofadr[i]], 0.01 * whole)
-        return motor, motor * max(whole - motor, motor) / max(whole, 2 * motor)
+        link = max(whole - motor, 0.01 * whole)
+        return motor * link / (motor + link)
 
     def parameters(self, model, i):
-        motor, reduced = self._inertias(model, i)
-        stiffest = motor / model.opt.timestep**2
+        reduced = self._reduced(model, i)
+        stiffest = reduced / model.opt.timestep**2
         units = [self.unit(model, i, *u) for u in (("N·m/rad", "N/m"), ("N·m·s/rad", "N·s/m"))]
         soft, slow = reduced * (2 * np.pi) ** 2, 2 * np.pi * reduced
         return (
@@ -207,7 +208,7 @@ class JointElasticity(Backlash):
         )
 
     def probes(self, model, i, recordings):
-        _, reduced = self._inertias(model, i)
+        reduced = self._reduced(model, i)
         stiffest = self.parameters(model, i)[0].high
         tones = 2 * np.pi * np.array(TONES)
         return np.array([(min(reduced * w**2, stiffest), 2 * DAMPED * reduced * w) for w in tones])
@@ -222,12 +223,8 @@ class JointElasticity(Backlash):
 
     def edit(self, model, i, values):
         joint = model.joint(self._load(model, i)).id
-        motor, _ = self._inertias(model, i)
-        stiffness = min(values[0], motor / model.opt.timestep**2)
-        model.jnt_stiffness[joint], model.dof_damping[model.jnt_dofadr[joint]] = (
-            stiffness,
-            values[1],
-        )
+        model.jnt_stiffness[joint] = values[0]
+        model.dof_damping[model.jnt_dofadr[joint]] = values[1]
 
     def write(self, spec, model, i, values):
         load = self.build(spec, model, i)
