@@ -5,12 +5,14 @@
 Every rate stands with its hits, its trials and its 95 % Wilson interval.
 """
 
-import html
 import json
 import math
 from dataclasses import dataclass
+from importlib.resources import files
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from scipy.stats import binomtest
 
 from diagnosis.common.atomic_files import write_whole
@@ -18,6 +20,7 @@ from diagnosis.common.atomic_files import write_whole
 WORSE = 1.01  # times the nominal error: predicts worse
 CLOSE = 1.1  # times the true model's error: as good as it
 STRONG = 3.0  # times the noise
+FEW = 30  # failures that are not folded away
 SIZES = (0.0, 3.0, 10.0, 30.0, 100.0, math.inf)
 GOALS = {
     "strict success, something hidden": "≥ 85 %",
@@ -287,47 +290,31 @@ def failures(results):
     return lines
 
 
-def _table(header, lines):
-    cells = lambda tag, values: "".join(f"<{tag}>{html.escape(str(v))}</{tag}>" for v in values)
-    body = "".join(f"<tr>{cells('td', line)}</tr>" for line in lines)
-    return f"<div class=wide><table><tr>{cells('th', header)}</tr>{body}</table></div>"
-
-
-STYLE = (
-    "body{font:16px/1.5 sans-serif;max-width:70em;margin:auto;padding:1em;color:#222}"
-    ".wide{overflow-x:auto}table{border-collapse:collapse;font-size:85%}"
-    "td,th{padding:.2em .6em;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}"
-)
-
-
 def write(tables, out):
     """Write the page of {tool: rows} to `out`, whole. Raises WriteError."""
     parsed = {name: [parse(row) for row in rows] for name, rows in tables.items()}
     columns = [rates(results) for results in parsed.values()]
     first = next(iter(tables.values()))
-    versions = sorted({row["version"][:12] or "development" for row in first})
-    lines = [
-        (c[0][0], c[0][1], GOALS.get(c[0][1], ""), *(cell[2] for cell in c)) for c in zip(*columns)
-    ]
-    body = [
-        "<h1>Hidden physics: the benchmark</h1>",
-        f"<p>{len(first)} trials, settings “{html.escape(first[0]['settings'])}”, "
-        f"version {html.escape(', '.join(versions))}. Hits over trials with 95 % Wilson "
-        "intervals. docs/validation.md has the rules.</p>",
-        _table(("", "rate", "goal", *parsed), lines),
-    ]
-    header = ("by", "", "strict success", "named", "false claim", "predicts worse")
-    for name, results in parsed.items():
-        body += [f"<h2>{html.escape(name)}: where</h2>", _table(header, breakdown(results))]
-    columns = ("trial", "robot", "hidden (over the noise)", "said", "wrong")
-    for name, results in parsed.items():
-        body += [
-            f"<h2>{html.escape(name)}: every trial that is no success</h2>",
-            _table(columns, failures(results)),
-        ]
-    page = (
-        '<!doctype html><html lang="en"><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width">'
-        f"<title>Hidden physics</title><style>{STYLE}</style>{''.join(body)}</html>"
+    page = Environment(
+        loader=PackageLoader("diagnosis.trials"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    write_whole(out, page)
+    style = files("diagnosis.trials") / "templates/style.css"
+    text = page.get_template("page.html").render(
+        style=Markup(style.read_text(encoding="utf-8")),
+        count=len(first),
+        settings=first[0]["settings"],
+        versions=", ".join(sorted({row["version"][:12] or "development" for row in first})),
+        names=list(parsed),
+        rates=[
+            (c[0][0], c[0][1], GOALS.get(c[0][1], ""), *(cell[2] for cell in c))
+            for c in zip(*columns)
+        ],
+        breakdowns={name: breakdown(results) for name, results in parsed.items()},
+        failures={name: failures(results) for name, results in parsed.items()},
+        few=FEW,
+    )
+    write_whole(out, text.lstrip() + "\n")
