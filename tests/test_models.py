@@ -19,6 +19,7 @@ from models import (
     GaussianPolicy,
     InverseModel,
     Normalizer,
+    Regressor,
     Value,
     adam,
     gaussian_entropy,
@@ -27,6 +28,7 @@ from models import (
     least_squares_step,
     load_checkpoint,
 )
+from trpo import TRPOConfig, policy_update
 
 seeds = st.integers(0, 2**31 - 1)
 
@@ -242,6 +244,32 @@ def test_fit_normalises_by_the_training_rows():
 
 
 # --- checkpoints --------------------------------------------------------------------------------------
+
+
+def test_a_network_lies_in_memory_as_one_vector_whatever_became_of_it():
+    """Trained, loaded or new: rounding depends on where the factors of a product lie."""
+    fresh, trained = GaussianPolicy(5, 2), GaussianPolicy(5, 2)
+    policy_update(trained, torch.randn(50, 5), torch.randn(50, 2), torch.randn(50), TRPOConfig())
+    loaded = GaussianPolicy(5, 2)
+    loaded.load_state_dict(trained.state_dict())
+    starts = np.cumsum([0, *(p.numel() for p in fresh.parameters())])[:-1]
+    for policy in (fresh, trained, loaded):
+        parameters = list(policy.parameters())
+        assert [p.storage_offset() for p in parameters] == list(starts)
+        assert len({p.untyped_storage().data_ptr() for p in parameters}) == 1
+
+
+def test_a_fit_ends_with_its_best_epoch_not_its_last():
+    """Noise alone: what is learnt of it makes the held-out rows worse."""
+    torch.manual_seed(0)
+    x, y = torch.randn(60, 3), torch.randn(60, 1)
+    model = Regressor(3, 1)
+    reported = model.fit(x, y, torch.Generator().manual_seed(0), patience=200, lr=1e-2)
+    held = torch.randperm(60, generator=torch.Generator().manual_seed(0))[:12]
+    with torch.no_grad():
+        miss = float(((model(x[held]) - y[held]) ** 2).mean().sqrt())
+    assert miss == pytest.approx(float(reported[0]), rel=1e-4)
+    assert miss < 0.9 * float(y[held].std())  # the last epoch: above 1
 
 
 def test_policy_survives_saving(tmp_path):

@@ -642,6 +642,14 @@ def test_rollouts_hand_out_true_successors():
     assert all(row[0] < 0.71 or abs(row[1]) > 0.19 for row in ends)
 
 
+def test_rollouts_hand_out_the_actions_that_the_robot_got():
+    env, learner = new_learner("Hopper-v4")
+    with torch.no_grad():
+        learner.policy.log_std.fill_(2.0)
+    tau = rollouts(learner.policy, env, 4, seed=0)[1]
+    assert np.abs(tau.a).max() == 1 and (np.abs(tau.a) == 1).mean() > 0.5
+
+
 def test_transitions_join_and_split():
     make = lambda n, seed: Transitions(
         *np.random.default_rng(seed).normal(size=(3, n, 2)).astype(np.float32)
