@@ -24,6 +24,7 @@ from envs import BatchEnv, EnvError, parse_perturbation
 from models import DEEP, SHALLOW, GaussianPolicy, Value, load_checkpoint, torch_threads
 from rgat import METHODS, RGAT, GroundedEnv, Solved, identity, one_step_error
 from training.physics_grounding import Physics, PhysicsThen
+from training.real_data import RealData
 from training.run_folder import (
     Bar,
     Run,
@@ -52,7 +53,7 @@ UNSOUND = (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueE
 def algorithm_1(s, run, bar):
     """Algorithm 1 of the paper under settings s. Its results are left in run; a run begun earlier goes on."""
     sim = BatchEnv(s.env, s.num_envs, nthread=s.threads)
-    real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=s.threads)
+    real = RealData(s.real_data, sim) if s.real_data else real_world(s)
     learner, grounding, tau_real = start(s, run, sim, real, bar)
     policy = learner.policy
 
@@ -75,10 +76,18 @@ def algorithm_1(s, run, bar):
         )  # 6: end while; the run keeps the best policy
 
 
+def real_world(s):
+    """The world that stands for the real one: the sim with what --real says."""
+    return BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=s.threads)
+
+
 def collect(s, grounding, policy, real, seed):
-    """tau_real of one grounding step: episodes of the stochastic policy, for the methods that learn from them."""
+    """tau_real of one grounding step, for the methods that learn from it: episodes of the
+    stochastic policy, or what was recorded since the last step."""
     if not grounding.learns_from_real:
-        return nothing(real)
+        return nothing(grounding.sim)
+    if s.real_data:
+        return real.collect()
     tau, episodes = rollouts(policy, real, s.real_trajectories, seed)[1], s.real_trajectories
     while len(tau) < grounding.least_transitions:
         tau, episodes = tau + rollouts(policy, real, 1, seed + episodes)[1], episodes + 1
@@ -98,7 +107,10 @@ def update_transformer(s, grounding, policy, sim, real, seeds, log):
     """The action transformer goes on (or begins anew, as the method has it). Returns its statistics: among them the one-step
     errors with it and without, on real transitions that nothing is fitted on and that no column counts."""
     stats = grounding.update(policy, s.at_steps, seeds("transformer"), log)
-    held_out = rollouts(policy, real, s.eval_episodes, seeds("held out"))[1]
+    if s.real_data:
+        held_out = real.held_out()
+    else:
+        held_out = rollouts(policy, real, s.eval_episodes, seeds("held out"))[1]
     error, change = one_step_error(grounding.sim, grounding.transformer, held_out)
     untouched = one_step_error(sim, identity, held_out)[0]
     return {
@@ -112,18 +124,14 @@ def update_transformer(s, grounding, policy, sim, real, seeds, log):
 
 def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
     """Judge the policy on real, and write down everything that the next step, or a resumed run, needs."""
-    seed = seed_for(s.seed, step, "evaluate")
-    deterministic, seen = rollouts(learner.policy, real, s.eval_episodes, seed, deterministic=True)
-    stochastic, seen_too = rollouts(learner.policy, real, s.eval_episodes, seed)
+    returns, judging = judge(s, learner.policy, real, seed_for(s.seed, step, "evaluate"))
     steps, seconds = bar.lap()
     on_real = s.algo == "real"
     extra = grounding.sim.counterfactual_steps + stats.pop("sim_transitions", 0)
     grounding.sim.counterfactual_steps = 0
     spent = {
         "real_transitions": steps if on_real else len(tau_new),
-        "real_transitions_judging": stats.pop("real_transitions_judging", 0)
-        + len(seen)
-        + len(seen_too),
+        "real_transitions_judging": stats.pop("real_transitions_judging", 0) + judging,
         "sim_steps": 0 if on_real else steps + extra,
         "seconds": seconds,
     }
@@ -131,13 +139,11 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
     row = {
         "grounding_step": step,
         **{name: type(n)(before[name]) + n for name, n in spent.items()},
-        "real_return_deterministic": float(deterministic.mean()),
-        "real_return_deterministic_se": standard_error(deterministic),
-        "real_return_stochastic": float(stochastic.mean()),
+        **returns,
         **stats,
     }
     acting = copy.deepcopy(learner.policy).checkpoint()
-    row["rolled_back_to"] = roll_back(s, run, learner, row["real_return_deterministic"])
+    row["rolled_back_to"] = roll_back(s, run, learner, returns.get("real_return_deterministic"))
     transformer = grounding.state() if step else {}
     run.record(
         row,
@@ -145,14 +151,29 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
             "learner": learner.state(),
             "grounding": transformer,
             "acting": acting,
+            "recordings": real.seen if s.real_data else [],
             "world": {"env": s.env, "algo": s.algo, "settings": transforming(s.grounding)},
         },
         tau_new,
     )
     bar.scalars("on real", row, step)
-    bar.say(
-        f"step {step}: {row['real_return_deterministic']:.0f} ± {row['real_return_deterministic_se']:.0f} on real"
-    )
+    mean, se = (returns.get(f"real_return_deterministic{k}", np.nan) for k in ("", "_se"))
+    bar.say(f"step {step}: " + ("not judged" if s.real_data else f"{mean:.0f} ± {se:.0f} on real"))
+
+
+def judge(s, policy, real, seed):
+    """What a policy returns on real, as columns of progress.csv, and the real transitions that it
+    took to know; nothing where the real world can only be recorded."""
+    if s.real_data:
+        return {}, 0
+    deterministic, seen = rollouts(policy, real, s.eval_episodes, seed, deterministic=True)
+    stochastic, seen_too = rollouts(policy, real, s.eval_episodes, seed)
+    returns = {
+        "real_return_deterministic": float(deterministic.mean()),
+        "real_return_deterministic_se": standard_error(deterministic),
+        "real_return_stochastic": float(stochastic.mean()),
+    }
+    return returns, len(seen) + len(seen_too)
 
 
 def transforming(settings):
@@ -184,7 +205,7 @@ def start(s, run, sim, real, bar):
     learner = new_learner(s)  # seeds torch for the grounding's networks too
     told = (real.model,) if s.algo == "oracle" else ()
     grounding = method(world, s.grounding, *told)
-    tau_real = nothing(real)
+    tau_real = nothing(sim)
     done = len(run.progress) - 1
     if done >= 0:
         saved = run.checkpoint(done)
@@ -196,6 +217,8 @@ def start(s, run, sim, real, bar):
             raise RunError(
                 f"{run.folder}/step_{done:02d}.pt does not belong to this run: start a new one"
             ) from None
+        if s.real_data:
+            real.seen = list(saved["recordings"])
         for step in range(1, done + 1):
             tau_real += Transitions(*run.real(step))
         bar.skip(int(run.progress[-1]["real_transitions" if s.algo == "real" else "sim_steps"]))
@@ -218,6 +241,8 @@ def start(s, run, sim, real, bar):
 
 def reference(s, run, learner, real, bar):
     """The green line: what a policy trained from scratch on real, for --reference-steps, returns there."""
+    if s.real_data:
+        return
     if s.algo != "real":
         learner = new_learner(s)
         learner.load(pretrained(s, "real", real, s.reference_steps, bar))
@@ -241,8 +266,25 @@ def new_learner(s):
     return TRPO(policy, Value(nobs), s.target)
 
 
+def check_files(s):
+    """Raises RunError where the files that a run is to begin with are none that it can use."""
+    if s.real_data:
+        RealData(s.real_data, BatchEnv(s.env, 1))
+    if s.policy_from:
+        given_policy(s, new_learner(s))
+
+
 def take_over(s, learner, world, bar):
     """Begin with the policy of a file, and give it a critic of the world that it improves in."""
+    policy = given_policy(s, learner)
+    learner.policy.load_state_dict(policy.state_dict())
+    learner.value.normalizer.load_state_dict(policy.normalizer.state_dict())
+    seed, log = seed_for(s.seed, 0, "pretrain"), bar.phase(0, "critic")
+    learner.learn(world, s.pretrain_steps, seed, on_update=log, critic_alone=True)
+
+
+def given_policy(s, learner):
+    """The policy of --policy-from. Raises RunError for a file without one that fits the learner."""
     try:
         policy = GaussianPolicy.load(s.policy_from)
     except ValueError as error:
@@ -252,10 +294,7 @@ def take_over(s, learner, world, bar):
             f"--policy-from {s.policy_from} has layers of {policy.sizes}, --env {s.env} and "
             f"--policy {s.policy} make {learner.policy.sizes}"
         )
-    learner.policy.load_state_dict(policy.state_dict())
-    learner.value.normalizer.load_state_dict(policy.normalizer.state_dict())
-    seed, log = seed_for(s.seed, 0, "pretrain"), bar.phase(0, "critic")
-    learner.learn(world, s.pretrain_steps, seed, on_update=log, critic_alone=True)
+    return policy
 
 
 def pretrained(s, world, env, steps, bar):
@@ -300,7 +339,15 @@ def pretrained(s, world, env, steps, bar):
 def verdict(s, run):
     """The best policy judged once more, on real episodes that did not choose it: best.json, and a line that says so."""
     step, policy = run.best(), run.policy()
-    real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=s.threads)
+    if s.real_data:
+        rows, error = run.progress[-1]["real_transitions"], run.progress[-1]["at_one_step_error"]
+        return (
+            f"{run.folder}: policy.pt is of grounding step {step}, from {rows} recorded "
+            f"transitions; one-step error {float(error or 'nan'):.3g}. Record the robot under it, "
+            f"add the files to {s.real_data}, and go on: train.py --resume {run.folder} "
+            f"--grounding-steps {step + 1}"
+        )
+    real = real_world(s)
     seed = seed_for(s.seed, step, "best")
     returns, seen = rollouts(policy, real, 2 * s.eval_episodes, seed, deterministic=True)
     best = {
@@ -325,6 +372,8 @@ def replay(folder):
     s = settings_of(folder, saved)
     policy = run.policy()
     worlds = {"sim": BatchEnv(s.env, 1), "real": BatchEnv(s.env, 1, parse_perturbation(s.real))}
+    if s.real_data:
+        worlds.pop("real")
     if policy.sizes[0] != worlds["sim"].single_observation_space.shape[0]:
         raise RunError(
             f"{folder}/policy.pt was trained on another task than {s.env}: start a new run"
@@ -421,6 +470,7 @@ def main(argv=None):
             s = Settings(
                 **{f.name: getattr(args, f.name) for f in dataclasses.fields(Settings)}
             ).completed()
+            check_files(s)
             run = Run.create(args.out or f"runs/{s.env}-{s.algo}-s{s.seed}", dataclasses.asdict(s))
         with quiet():  # MuJoCo's own warnings: an unstable simulation is told below, in one line
             algorithm_1(s, run, Bar(s, run, args.tensorboard and tensorboard(run.folder)))

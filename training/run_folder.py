@@ -126,7 +126,7 @@ class Run:
             settings, run.versions = config["settings"], dict(config["versions"])
             run.progress = run._read("progress.csv")
             for row in run.progress:
-                [float(row[k]) for k in ALWAYS]
+                [float(row[k] or "nan") for k in ALWAYS]
             done = len(run.progress)
             run.train = [
                 row for row in run._read("train.csv") if int(row["grounding_step"]) < max(done, 1)
@@ -165,20 +165,21 @@ class Run:
             np.savez(data, s=real.s, a=real.a, s_next=real.s_next)
             write_whole(self.folder / f"real_{step:02d}.npz", data.getvalue())
         save_whole(self.folder / f"step_{step:02d}.pt", checkpoint)
-        if row["real_return_deterministic"] > max(self.returns(), default=-np.inf):
-            save_whole(self.folder / "policy.pt", checkpoint["acting"])
         self.progress.append({k: row.get(k, "") for k in PROGRESS})
+        if self.best() == step:
+            save_whole(self.folder / "policy.pt", checkpoint["acting"])
         write_table(self.folder / "train.csv", TRAIN, self.train)
         write_table(self.folder / "progress.csv", PROGRESS, self.progress)
         self.plot()
 
     def returns(self):
-        """The deterministic return on real after every grounding step."""
-        return [float(row["real_return_deterministic"]) for row in self.progress]
+        """The deterministic return on real after every grounding step; nan: not judged."""
+        return [float(row["real_return_deterministic"] or "nan") for row in self.progress]
 
     def best(self):
-        """The grounding step whose policy returned most."""
-        return int(np.argmax(self.returns()))
+        """The grounding step whose policy returned most, the last one where none was judged."""
+        returns = self.returns()
+        return len(returns) - 1 if np.isnan(returns).all() else int(np.nanargmax(returns))
 
     def checkpoint(self, step):
         """What record() saved for a step. Raises RunError if it is missing or damaged."""
@@ -217,8 +218,9 @@ class Run:
         figure = Figure(figsize=(10, 4), layout="constrained")
         left, right = figure.subplots(1, 2)
         steps = [int(r["grounding_step"]) for r in self.progress]
-        mean = np.array([float(r["real_return_deterministic"]) for r in self.progress])
-        se = np.array([float(r["real_return_deterministic_se"]) for r in self.progress])
+        number = lambda name: np.array([float(r[name] or "nan") for r in self.progress])
+        mean = number("real_return_deterministic")
+        se = number("real_return_deterministic_se")
         if steps:
             left.errorbar(
                 steps,
@@ -229,11 +231,11 @@ class Run:
                 capsize=3,
                 label="on real, deterministic",
             )
-            stochastic = [float(r["real_return_stochastic"]) for r in self.progress]
+            stochastic = number("real_return_stochastic")
             left.plot(steps, stochastic, color="#1f5fa8", ls=":", label="on real, stochastic")
         for name, value in self.lines.items():
             left.axhline(value, color="#2e8b57", lw=1.2, label=name)
-        if steps:
+        if steps and np.isfinite(mean[0]):
             left.axhline(mean[0], color="#c0392b", lw=1.2, label="before grounding")
         left.set(xlabel="grounding step", ylabel="return on real")
         left.xaxis.get_major_locator().set_params(integer=True)

@@ -80,6 +80,11 @@ class Settings:
         None,
         "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)",
     )
+    real_data: str = option(
+        "",
+        "folder of recordings of the actual robot, in the diagnosis' formats, in the place of a "
+        "real world to roll out in; nothing is judged then",
+    )
     policy: str = option(
         "deep",
         "hidden layers of the target policy: deep 2x64, shallow 1x4",
@@ -164,7 +169,9 @@ class Settings:
             "real": real,
             "real_trajectories": 1 if self.algo.startswith("physics") else 50,
         }
-        if self.pretrain_steps is not None:
+        if self.real_data:
+            defaults |= {"grounding_steps": 1, "reference_steps": 0}
+        elif self.pretrain_steps is not None:
             defaults["reference_steps"] = self.pretrain_steps
         done = dataclasses.replace(
             self, **{k: v for k, v in defaults.items() if getattr(self, k) is None}
@@ -186,6 +193,11 @@ class Settings:
             raise RunError(f"--at-gamma is {self.at_gamma}: it must be at least 0 and below 1")
         if not 0 <= self.roll_back <= 1:
             raise RunError(f"--roll-back is {self.roll_back}: it must be between 0 and 1")
+        if self.real_data and (self.algo in ("oracle", "real") or self.roll_back):
+            raise RunError(
+                "--real-data gives recordings alone: --algo oracle and real, and --roll-back, need "
+                "a real world to act in"
+            )
         if not 0 <= self.ane_width < np.inf or not 0 <= self.at_entropy < np.inf:
             raise RunError("--ane-width and --at-entropy must be 0 or more")
         model = mujoco.MjModel.from_xml_path(str(model_path(self.env)))
