@@ -2,7 +2,7 @@
 
     real = RealData("recordings", sim)        # every file that the diagnosis reads
     tau_real = real.collect()                 # the rows of files not seen before, without ...
-    real.held_out()                           # ... the last fifth of each, which nothing is fitted on
+    real.held_out()                           # ... the last fifth of each, never fitted
 
 A robot is recorded under the policy that a run has left in policy.pt; its files are added to the
 folder, and the run is resumed with one grounding step more.
@@ -44,7 +44,7 @@ class RealData:
         return transitions[:cut], transitions[cut:]
 
     def _transitions(self, recording):
-        """One recording at the task's control period; rows of which something is missing are left out."""
+        """One recording at the task's control period, without rows that lack something."""
         step = self.sim.dt / np.median(np.diff(recording.time))
         every = max(1, round(step))
         if abs(step - every) > TOLERANCE * every:
