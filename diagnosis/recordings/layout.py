@@ -106,7 +106,8 @@ class Layout:
                 continue
             if ours is not None:
                 sources[ours] = Source(column)
-        return Plan(self, _with_controls(path, sources, header, model, self))
+        foreign = self.mapped or any(ours != column for ours, column in natural.items())
+        return Plan(self, _with_controls(path, sources, header, model, self, foreign))
 
     def _check_joints(self, path, natural, model):
         """Raises RecordingError where [joints] names one that the model or the file does not
@@ -133,11 +134,11 @@ def _few(names):
     return ", ".join(repr(n) for n in names[:12]) + (", ..." if len(names) > 12 else "")
 
 
-def _with_controls(path, sources, header, model, layout):
+def _with_controls(path, sources, header, model, layout, foreign):
     """The sources with one for every control that follows from an effort or a target. Raises
     RecordingError on what is missing."""
     sources = dict(sources)
-    _complete(path, sources, ("time", "qpos:"), header, model, layout)
+    _complete(path, sources, ("time", "qpos:"), header, model, foreign)
     known = columns_of(model)
     for a in range(model.nactuator):
         control = f"ctrl:{model.actuator(a).name or a}"
@@ -173,11 +174,11 @@ def _with_controls(path, sources, header, model, layout):
                 f"servo; give "
                 "its targets, or a model with motors"
             )
-    _complete(path, sources, "ctrl:", header, model, layout)
+    _complete(path, sources, "ctrl:", header, model, foreign)
     return sources
 
 
-def _complete(path, sources, kinds, header, model, layout):
+def _complete(path, sources, kinds, header, model, foreign):
     """Raises RecordingError where a column of these kinds has no source."""
     for name in ["time", *columns_of(model)]:
         if name not in sources and name.startswith(kinds):
@@ -188,9 +189,13 @@ def _complete(path, sources, kinds, header, model, layout):
                 if name.startswith("ctrl:")
                 else "seconds, increasing"
             )
-            has = f"; it has {_few(header)}" if layout.mapped else ""
+            if not foreign:
+                raise RecordingError(
+                    f"{path}: column {name!r} is missing from the header; add it ({hint})"
+                )
             raise RecordingError(
-                f"{path}: column {name!r} is missing from the header; add it ({hint}){has}"
+                f"{path}: {name!r} is missing, and nothing in the file becomes it; it has "
+                f"{_few(header)}; say which with --map ({hint})"
             )
 
 

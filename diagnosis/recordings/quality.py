@@ -139,13 +139,15 @@ def encoder_quantum(values: np.ndarray) -> float:
     steps = steps[steps > 1e-9 * max(1.0, np.abs(levels).max(initial=0))]
     if len(steps) < 3:
         return 0.0
-    step = float(np.quantile(steps, 0.05))
-    near = steps < 1.5 * step
-    step = float(steps[near].mean())
-    whole = np.rint(steps / step)
-    if np.mean(np.abs(steps / step - whole) < 0.1) < LATTICE:
-        return 0.0
-    return float(steps.sum() / whole.sum())
+    for parts in (1, 2, 3):  # where it moves fast, hardly two readings are neighbours
+        step = steps.min() / parts
+        for most in (1.5, 3.5, 8.5, 20.5):  # rounding in the file tells on large multiples
+            near = steps[steps < most * parts * step]
+            step = near.sum() / np.rint(near / step).sum()
+        whole = np.rint(steps / step)
+        if np.mean(np.abs(steps / step - whole) < 0.1) > LATTICE:
+            return float(steps.sum() / whole.sum())
+    return 0.0
 
 
 def differenced_velocity(time, position, velocity) -> Differenced | None:

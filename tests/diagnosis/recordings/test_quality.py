@@ -59,10 +59,15 @@ def test_the_step_of_an_encoder(digits):
     assert encoder_quantum(np.zeros(50)) == 0
 
 
-def test_the_step_of_an_encoder_that_is_read_while_it_moves_fast():
-    read = STEP * np.rint(20 * motion(T[:600]) / STEP)  # hardly two values are neighbours
-    got = encoder_quantum(read)
-    assert got == 0 or abs(got / STEP - np.rint(got / STEP)) < 1e-3
+@pytest.mark.parametrize("speed", [3, 10, 20])
+def test_the_step_of_an_encoder_that_is_read_while_it_moves_fast(speed):
+    read = np.round(STEP * np.rint(speed * motion(T[:600]) / STEP), 6)
+    assert abs(encoder_quantum(read) - STEP) < 1e-3 * STEP  # hardly two values are neighbours
+
+
+def test_noise_has_no_step():
+    for seed in range(200):
+        assert encoder_quantum(np.random.default_rng(seed).normal(size=30)) == 0
 
 
 @pytest.mark.parametrize("pole, lag", [(0.0, 0), (0.0, 2), (0.7, 0)])
