@@ -71,17 +71,17 @@ def picture(best: Excitation, model) -> bytes:
     )
     for a, axis in zip(range(model.nu), axes[:, 0]):
         axis.plot(best.time, best.ctrl[:, a], color="black", linewidth=1)
-        axis.set_ylabel(model.actuator(a).name)
+        axis.set_ylabel(f"control of\n{model.actuator(a).name}")
     for j, axis in zip(range(len(joints)), axes[model.nu :, 0]):
         for name, motion in zip(best.names, best.motions):
             axis.plot(best.time, motion[:, j], linewidth=1, label=name)
-        axis.set_ylabel(joints[j])
+        axis.set_ylabel(f"position of\n{joints[j]}")
     if best.nats is not None:
         axes[model.nu, 0].legend(fontsize=8, loc="upper right")
         figure.suptitle(f"Expected ratio of evidence: {ratio(best.nats)}", fontsize=11)
     axes[-1, 0].set_xlabel("time, s")
     figure.tight_layout()
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110)
+    figure.savefig(stream, format="png", dpi=80)
     pyplot.close(figure)
     return stream.getvalue()
