@@ -87,6 +87,45 @@ SEPARATING = [
         "shape",
     ),
     (
+        {"load_friction", "coulomb_friction", "friction_map", "coupled_friction"},
+        "repeat one slow motion through the whole travel, without and with a weight hung on: friction "
+        "that follows the load grows with it, a map stays where it is",
+    ),
+    (
+        {"coupled_friction", "coupled_inertia", "armature", "viscous_damping"},
+        "hold one of the two joints fast and move the other: what couples them shows at the held one",
+    ),
+    (
+        {"presliding", "coulomb_friction", "stribeck_friction", "stiffness"},
+        "push gently, without breaking loose, and let go: presliding springs back, friction does not",
+    ),
+    (
+        {"joint_elasticity", "backlash", "delay", "lag"},
+        "hold the link fast and turn the motor a little both ways: elasticity gives in proportion to "
+        "the torque, backlash at once and then no more, a delay not at all",
+    ),
+    (
+        {"servo_stiffness", "gain", "stiffness", "spring_offset"},
+        "let the servo hold several set points against a known weight, then the joint with it off",
+    ),
+    (
+        {"servo_damping", "viscous_damping", "back_emf", "torque_speed"},
+        "back-drive the joint with its drive off, slowly and fast: what is left is the joint's own",
+    ),
+    (
+        {"rate_limit", "lag", "delay", "saturation", "torque_speed"},
+        "command steps of several sizes: under a rate limit the rise takes longer for the larger "
+        "ones, under a lag all take the same time, a saturation cuts the largest off",
+    ),
+    (
+        {"gain_fade", "gain", "saturation", "payload_change", "viscous_damping"},
+        "repeat the same motion after a rest: a drive that faded has recovered",
+    ),
+    (
+        {"friction_map", "cogging", "coulomb_friction"},
+        "move slowly through the travel, both ways: cogging keeps its sign, friction turns it",
+    ),
+    (
         {"saturation", "gain", "dead_zone", "nonlinear_stiffness", "joint_stop"},
         "drive at a small, a medium and a large amplitude",
     ),

@@ -15,6 +15,10 @@ SPOKEN = {
     "stribeck": "Stribeck",
     "back_emf": "back-EMF",
     "center_of_mass": "centre of mass",
+    "load_friction": "load-dependent friction",
+    "friction_map": "friction along the travel",
+    "torque_speed": "torque-speed limit",
+    "gain_fade": "fading gain",
 }
 ALWAYS_THERE = {
     "center_of_mass",
@@ -40,8 +44,12 @@ def effect_words(effect: str) -> str:
 
 
 def place_words(place: dict) -> str:
-    """{"kind": "joint", "name": "elbow"} -> "joint elbow"."""
-    return "the world" if place["kind"] == "world" else f"{place['kind']} {place['name']}"
+    """{"kind": "joint", "name": "elbow"} -> "joint elbow"; "a+b" are two joints."""
+    if place["kind"] == "world":
+        return "the world"
+    if place["kind"] == "joint" and "+" in place["name"]:
+        return f"joints {place['name'].replace('+', ' and ')}"
+    return f"{place['kind']} {place['name']}"
 
 
 def number(value: float | None, digits: int = 3) -> str:

@@ -119,3 +119,9 @@ def test_every_listed_pair_of_rivals_has_an_experiment_of_its_own():
                 lines[0].split(": ", 1)[1] == lines[1].split(": ", 1)[1]
                 and experiments.OTHERWISE not in lines[0]
             )
+
+
+def test_places_in_words():
+    places = [("joint", "elbow"), ("joint", "hip+knee"), ("body", "a+b"), ("world", "world")]
+    words = [wording.place_words({"kind": kind, "name": name}) for kind, name in places]
+    assert words == ["joint elbow", "joints hip and knee", "body a+b", "the world"]
