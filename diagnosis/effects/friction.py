@@ -2,7 +2,7 @@
 
 Speed: Stribeck's fall. Load: gears. Place: bearings and rails that run out of true. A simulation
 sets the level anew before each step (see Effect.limit), and beside corrected.xml a script does
-(corrected.py); Stribeck's alone has an MJCF form.
+(corrected.py).
 """
 
 from dataclasses import replace
@@ -11,14 +11,11 @@ import numpy as np
 
 from diagnosis.effects.base import (
     HUGE,
-    JOINT_TRANSMISSION,
     Candidate,
     Parameter,
     Part,
     Place,
     catalogue,
-    passive,
-    runge_kutta,
 )
 from diagnosis.effects.drives import drive_torque, drives_of
 from diagnosis.effects.joints import (
@@ -35,86 +32,6 @@ FALLS = 0.05
 SELF_LOCKING = 2.0  # share of the load beyond which no drive would turn
 CYCLES = 1.0, 2.0, 3.0  # of a friction map over the travel, to try first
 PHASES = 0.0, np.pi / 2, np.pi, 1.5 * np.pi
-
-
-@catalogue
-class StribeckFriction(JointEffect):
-    """Dry friction that falls from `static` at rest to `coulomb` when moving faster than
-    `velocity`.
-
-    |F| = coulomb + (static − coulomb) exp(−(v/velocity)²): here as frictionloss `static` and a
-    force that gives back what it is too much once moving; in MJCF with LuGre bristles.
-    """
-
-    name, simplicity, related, amplitudes = "stribeck_friction", 3, DISSIPATION, 2
-    acts_through = "velocity"
-
-    def parameters(self, model, i):
-        M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
-        return (
-            Parameter("coulomb", force, 0.0, 0.0, HUGE * M, 0.05 * M),
-            Parameter("static", force, 0.0, 0.0, HUGE * M, 0.05 * M),
-            Parameter("velocity", self.unit(model, i, "rad/s", "m/s"), 0.1, 1e-4, 100.0, 0.01),
-        )
-
-    def suited(self, parameters, model, i, recordings):
-        """It has fallen at the speeds that are reached: what still falls there is another law of
-        friction."""
-        coulomb, static, velocity = parameters
-        _, speed = self.travel(model, i, recordings)
-        return (
-            coulomb,
-            static,
-            replace(
-                velocity,
-                high=max(
-                    velocity.nominal, np.quantile(speed, 0.5) + 1e-4, 0.5 * np.quantile(speed, 0.98)
-                ),
-            ),
-        )
-
-    def probes(self, model, i, recordings):
-        step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
-        slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
-        return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
-
-    def possible(self, values, nominal):
-        """It falls with speed, by enough to matter."""
-        return values[1] > (1 + FALLS) * values[0]
-
-    def edit(self, model, i, values):
-        CoulombFriction().edit(model, i, values[1:2])
-
-    def force(self, models, i, values):
-        d = models[0].jnt_dofadr[i]
-        coulomb, static, velocity = values.T
-
-        def released(qpos, qvel, ctrl, time):
-            v, out = qvel[:, d], np.zeros_like(qvel)
-            out[:, d] = (coulomb - static) * np.expm1(-((v / velocity) ** 2)) * np.sign(v)
-            return out
-
-        return released
-
-    def write(self, spec, model, i, values):
-        # bristles as stiff as the time step can carry
-        joint, h, (coulomb, static, velocity) = model.joint(i).name, spec.option.timestep, values
-        M = (
-            1 / model.dof_invweight0[model.jnt_dofadr[i]]
-        )  # what the joint feels, its neighbours free
-        if static == coulomb:
-            return CoulombFriction().write(spec, model, i, (coulomb,))
-        # they carry what falls off and a share of the rest, frictionloss what is left
-        share = (0.05 if runge_kutta(model) else 1e-3) * (static - coulomb)
-        share = min(share, coulomb) if share > 0 else coulomb
-        stiffness, damping = 0.1 * M / h**2, 0.0
-        if runge_kutta(model):  # also explodes where they relax within a step
-            stiffness = min(0.1 * stiffness, share / (h * max(3.0, 10 * velocity)))
-            damping = np.sqrt(stiffness * M)
-        CoulombFriction().write(spec, model, i, (coulomb - share,))
-        lugre = [stiffness, damping, share, static - coulomb + share, velocity]
-        passive(spec, f"stribeck_friction:{joint}", JOINT_TRANSMISSION, joint, lugre=lugre)
-        return "mjcf"
 
 
 class DryFriction(JointEffect):
@@ -152,6 +69,77 @@ class DryFriction(JointEffect):
             return out
 
         return limit
+
+
+@catalogue
+class StribeckFriction(DryFriction):
+    """Dry friction that falls from `static` at rest to `coulomb` when moving faster than
+    `velocity`.
+
+    |F| ≤ coulomb + (static − coulomb) exp(−(v/velocity)²); N·m (N), velocity in rad/s (m/s).
+    corrected.xml has its frictionloss `coulomb`, the rest stands in corrected.py: the LuGre
+    bristles of
+    MuJoCo's dcmotor fall alike in steady motion, but stick and slip otherwise. Source: Stribeck
+    (1902);
+    Armstrong-Hélouvry, Dupont, Canudas de Wit (1994).
+    """
+
+    name, simplicity, related, amplitudes = "stribeck_friction", 3, DISSIPATION, 2
+    loaded = False
+
+    def parameters(self, model, i):
+        M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
+        return (
+            Parameter("coulomb", force, 0.0, 0.0, HUGE * M, 0.05 * M),
+            Parameter("static", force, 0.0, 0.0, HUGE * M, 0.05 * M),
+            Parameter("velocity", self.unit(model, i, "rad/s", "m/s"), 0.1, 1e-4, 100.0, 0.01),
+        )
+
+    def suited(self, parameters, model, i, recordings):
+        """It has fallen at the speeds that are reached: what still falls there is another law of
+        friction."""
+        coulomb, static, velocity = parameters
+        _, speed = self.travel(model, i, recordings)
+        return (
+            coulomb,
+            static,
+            replace(
+                velocity,
+                high=max(
+                    velocity.nominal, np.quantile(speed, 0.5) + 1e-4, 0.5 * np.quantile(speed, 0.98)
+                ),
+            ),
+        )
+
+    def probes(self, model, i, recordings):
+        step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
+        slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
+        return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
+
+    def possible(self, values, nominal):
+        """It falls with speed, by enough to matter."""
+        return values[1] > (1 + FALLS) * values[0]
+
+    def edit(self, model, i, values):
+        CoulombFriction().edit(model, i, values[:1])
+
+    def level(self, models, i, values):
+        d = models[0].jnt_dofadr[i]
+        coulomb, static, velocity = values.T
+
+        def fallen(qpos, qvel, ctrl, time, qfrc_bias):
+            return (static - coulomb) * np.exp(-((qvel[:, d] / velocity) ** 2))
+
+        return fallen
+
+    def write(self, spec, model, i, values):
+        CoulombFriction().write(spec, model, i, values[:1])
+        return "mjcf" if values[1] <= values[0] else "python"
+
+    def part(self, model, i, values):
+        coulomb, static, velocity = map(float, values)
+        numbers = {"fall": static - coulomb, "velocity": velocity}
+        return Part("stribeck_fall", model.joint(i).name, numbers)
 
 
 @catalogue

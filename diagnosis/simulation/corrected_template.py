@@ -104,6 +104,11 @@ def drive(look, joint):
 # dry friction: the level up to which it holds the joint, on top of the model's frictionloss
 
 
+def stribeck_fall(look, joint, fall, velocity):
+    """What friction at rest has more: fall · exp(−(v/velocity)²)."""
+    return fall * np.exp(-((look.velocity(joint) / velocity) ** 2))
+
+
 def load_friction(look, joint, driving, driven, external):
     """share · |τ_drive − external · τ_load|, a share for the drive moving the joint, one for the
     load."""
@@ -230,7 +235,7 @@ def effort_fade(look, wanted, memory, tires):
     return wanted * np.exp(-tires * effort)
 
 
-FRICTION = {f.__name__: f for f in (load_friction, friction_wave, friction_curve)}
+FRICTION = {f.__name__: f for f in (stribeck_fall, load_friction, friction_wave, friction_curve)}
 FORCE = {f.__name__: f for f in (curve, wave, surface)}
 DRIVE = {f.__name__: f for f in (dead_zone_of_force, torque_speed, gain_fade)}
 CONTROL = {f.__name__: f for f in (dead_zone, rate_limit, effort_fade)}
