@@ -249,8 +249,9 @@ class Effect:
         raise NotImplementedError
 
     def part(self, model, i, values):
-        """The Part of corrected.py that holds what write() left to it, in full; None for what
-        never does."""
+        """The Part of corrected.py that holds what write() left to it, in full, or several; None
+        for
+        what never does."""
         return None
 
     def overrides(self, method):

@@ -34,45 +34,8 @@ CYCLES = 1.0, 2.0, 3.0  # of a friction map over the travel, to try first
 PHASES = 0.0, np.pi / 2, np.pi, 1.5 * np.pi
 
 
-class DryFriction(JointEffect):
-    """Dry friction of a level that depends on the state: |F| ≤ level, added to the joint's
-    frictionloss."""
-
-    law = ""  # in corrected.py
-    acts_through, simplicity, related = "velocity", 3, ("coulomb_friction", *DISSIPATION, "gain")
-
-    def edit(self, model, i, values):
-        d = model.jnt_dofadr[i]
-        if not model.dof_frictionloss[d]:  # as CoulombFriction does: a stuck joint must not creep
-            model.dof_solref[d], model.dof_solimp[d] = SOLREF_FRICTION, SOLIMP_FRICTION
-
-    def write(self, spec, model, i, values):
-        joint = spec.joint(model.joint(i).name)
-        if not joint.frictionloss:
-            joint.solref_friction, joint.solimp_friction = SOLREF_FRICTION, SOLIMP_FRICTION
-        return "python"
-
-    def level(self, models, i, values):
-        """Function (qpos, qvel, ctrl, time, qfrc_bias) -> (S,), the level in the joint."""
-        raise NotImplementedError
-
-    def part(self, model, i, values):
-        numbers = {p.name: float(v) for p, v in zip(self.parameters(model, i), values)}
-        return Part(self.law, model.joint(i).name, numbers)
-
-    def limit(self, models, i, values):
-        d, level = models[0].jnt_dofadr[i], self.level(models, i, values)
-
-        def limit(qpos, qvel, ctrl, time, qfrc_bias):
-            out = np.zeros_like(qvel)
-            out[:, d] = level(qpos, qvel, ctrl, time, qfrc_bias)
-            return out
-
-        return limit
-
-
 @catalogue
-class StribeckFriction(DryFriction):
+class StribeckFriction(JointEffect):
     """Dry friction that falls from `static` at rest to `coulomb` when moving faster than
     `velocity`.
 
@@ -85,7 +48,7 @@ class StribeckFriction(DryFriction):
     """
 
     name, simplicity, related, amplitudes = "stribeck_friction", 3, DISSIPATION, 2
-    loaded = False
+    acts_through = "velocity"
 
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
@@ -121,16 +84,19 @@ class StribeckFriction(DryFriction):
         return values[1] > (1 + FALLS) * values[0]
 
     def edit(self, model, i, values):
-        CoulombFriction().edit(model, i, values[:1])
+        CoulombFriction().edit(model, i, values[1:2])
 
-    def level(self, models, i, values):
+    def force(self, models, i, values):
+        """What frictionloss `static` holds too much once moving is given back."""
         d = models[0].jnt_dofadr[i]
         coulomb, static, velocity = values.T
 
-        def fallen(qpos, qvel, ctrl, time, qfrc_bias):
-            return (static - coulomb) * np.exp(-((qvel[:, d] / velocity) ** 2))
+        def released(qpos, qvel, ctrl, time):
+            v, out = qvel[:, d], np.zeros_like(qvel)
+            out[:, d] = (coulomb - static) * np.expm1(-((v / velocity) ** 2)) * np.sign(v)
+            return out
 
-        return fallen
+        return released
 
     def write(self, spec, model, i, values):
         CoulombFriction().write(spec, model, i, values[:1])
@@ -138,8 +104,48 @@ class StribeckFriction(DryFriction):
 
     def part(self, model, i, values):
         coulomb, static, velocity = map(float, values)
-        numbers = {"fall": static - coulomb, "velocity": velocity}
-        return Part("stribeck_fall", model.joint(i).name, numbers)
+        name, fall = model.joint(i).name, static - coulomb
+        return (
+            Part("stribeck_rest", name, {"fall": fall}),
+            Part("stribeck_release", name, {"fall": fall, "velocity": velocity}),
+        )
+
+
+class DryFriction(JointEffect):
+    """Dry friction of a level that depends on the state: |F| ≤ level, added to the joint's
+    frictionloss."""
+
+    law = ""  # in corrected.py
+    acts_through, simplicity, related = "velocity", 3, ("coulomb_friction", *DISSIPATION, "gain")
+
+    def edit(self, model, i, values):
+        d = model.jnt_dofadr[i]
+        if not model.dof_frictionloss[d]:  # as CoulombFriction does: a stuck joint must not creep
+            model.dof_solref[d], model.dof_solimp[d] = SOLREF_FRICTION, SOLIMP_FRICTION
+
+    def write(self, spec, model, i, values):
+        joint = spec.joint(model.joint(i).name)
+        if not joint.frictionloss:
+            joint.solref_friction, joint.solimp_friction = SOLREF_FRICTION, SOLIMP_FRICTION
+        return "python"
+
+    def level(self, models, i, values):
+        """Function (qpos, qvel, ctrl, time, qfrc_bias) -> (S,), the level in the joint."""
+        raise NotImplementedError
+
+    def part(self, model, i, values):
+        numbers = {p.name: float(v) for p, v in zip(self.parameters(model, i), values)}
+        return Part(self.law, model.joint(i).name, numbers)
+
+    def limit(self, models, i, values):
+        d, level = models[0].jnt_dofadr[i], self.level(models, i, values)
+
+        def limit(qpos, qvel, ctrl, time, qfrc_bias):
+            out = np.zeros_like(qvel)
+            out[:, d] = level(qpos, qvel, ctrl, time, qfrc_bias)
+            return out
+
+        return limit
 
 
 @catalogue

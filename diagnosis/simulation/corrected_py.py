@@ -54,7 +54,7 @@ def python_parts(model, setting, written=None):
         if left and not candidate.when and tuple(values) != candidate.nominal:
             i = candidate.effect.id(model, candidate.place.name)
             part = candidate.effect.part(model, i, values)
-            parts += [part] if part else []
+            parts += [part] if isinstance(part, Part) else list(part or ())
     return parts
 
 

@@ -104,9 +104,9 @@ def drive(look, joint):
 # dry friction: the level up to which it holds the joint, on top of the model's frictionloss
 
 
-def stribeck_fall(look, joint, fall, velocity):
-    """What friction at rest has more: fall · exp(−(v/velocity)²)."""
-    return fall * np.exp(-((look.velocity(joint) / velocity) ** 2))
+def stribeck_rest(look, joint, fall):
+    """What friction at rest has more than in motion; stribeck_release gives it back."""
+    return fall + 0 * look.velocity(joint)
 
 
 def load_friction(look, joint, driving, driven, external):
@@ -173,6 +173,13 @@ def wave(look, joint, of, knots, forces, factor=None):
     return (forces[0] * np.cos(turn) + forces[1] * np.sin(turn)) * factor_of(look, factor)
 
 
+def stribeck_release(look, joint, fall, velocity):
+    """What friction at rest has too much for one moving: fall · (1 − exp(−(v/velocity)²)) along
+    v."""
+    v = look.velocity(joint)
+    return -fall * np.expm1(-((v / velocity) ** 2)) * np.sign(v)
+
+
 def surface(look, joint, of, knots, forces):
     """A force over two variables: bilinear between knots, flat beyond them."""
     forces, weights = np.asarray(forces), []
@@ -235,8 +242,8 @@ def effort_fade(look, wanted, memory, tires):
     return wanted * np.exp(-tires * effort)
 
 
-FRICTION = {f.__name__: f for f in (stribeck_fall, load_friction, friction_wave, friction_curve)}
-FORCE = {f.__name__: f for f in (curve, wave, surface)}
+FRICTION = {f.__name__: f for f in (stribeck_rest, load_friction, friction_wave, friction_curve)}
+FORCE = {f.__name__: f for f in (curve, wave, surface, stribeck_release)}
 DRIVE = {f.__name__: f for f in (dead_zone_of_force, torque_speed, gain_fade)}
 CONTROL = {f.__name__: f for f in (dead_zone, rate_limit, effort_fade)}
 

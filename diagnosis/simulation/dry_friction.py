@@ -34,7 +34,9 @@ class VariableFriction:
             if k == len(clones):
                 clones.append(copy(base))
             self.models[s] = clones[k]
-        self._fields = [(s, self.models[s].dof_frictionloss) for s in self.varying]
+            clones[k].dof_frictionloss[:] = base.dof_frictionloss
+        self._fields = [self.models[s].dof_frictionloss for s in self.varying]
+        self._dofs = set()  # those whose level has been other than the model's
         self._least = np.array(
             [(drives[s].model or nominal).dof_frictionloss for s in self.varying]
         )
@@ -47,6 +49,8 @@ class VariableFriction:
         for members, function in self.groups:
             state = (x[members] for x in (qpos, qvel, ctrl, time, qfrc_bias))
             levels[members] += np.maximum(np.nan_to_num(function(*state)), 0.0)
+        self._dofs |= set(np.flatnonzero(levels.any(axis=0)).tolist())
         levels = self._least + levels[self.varying]
-        for (_, field), level in zip(self._fields, levels):
-            field[:] = level
+        for d in self._dofs:  # one number at a time: quicker than rows of an array
+            for field, level in zip(self._fields, levels[:, d].tolist()):
+                field[d] = level
