@@ -297,7 +297,7 @@ def _mimics(rng, offers):
 def _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target):
     """Relative size at which the effect alone moves predictions by about `target` × the noise."""
     size, moved = 0.1, 0.0
-    for _ in range(4):
+    for _ in range(6):
         rng = np.random.default_rng(seed)
         nominal, true, laws, _ = hiding.hide(effect, spot, size, removed, robot, robot, usage, rng)
         brief = replace(plan, seconds=1.3, missing=0.0)

@@ -30,7 +30,7 @@ from diagnosis.trials.prediction import model_error
 from diagnosis.trials.replay import load_runs, replay
 from diagnosis.trials.robots import DEVELOPMENT, FINAL
 from diagnosis.trials.scoring import Score, score_findings
-from diagnosis.trials.tools import run_tool
+from diagnosis.trials.tools import ROOT, run_tool
 
 QUEUE = 2  # tasks given to a cluster at once, for each of its cores
 SETTINGS = {"development": DEVELOPMENT, "final": FINAL}
@@ -69,7 +69,7 @@ def run_trial(task, template, limit=900):
             "key": task.secret or "-".join(map(str, task.key)),
             "seals": task.seals,
             "version": task.version,
-            "tool": template,
+            "tool": template.replace(str(ROOT), "."),
             "settings": task.settings,
             "answer": answer_text(answer),
             "error_before": model_error(nominal, nominal, *load_runs(folder / HELD_OUT)),
@@ -79,7 +79,7 @@ def run_trial(task, template, limit=900):
         names = sorted(path.name for path in bench.glob("train_*.csv"))
         done = run_tool(template, bench, names, limit)
         row |= {"exit": done.exit, "seconds": done.seconds, "cpu_seconds": done.cpu_seconds}
-        row["note"] = done.note
+        row["note"] = done.note.replace(str(ROOT), ".")
         if done.exit == 0 and (done.report / "corrected.xml").exists():
             row["error_after"] = replay(bench / "sim.xml", done.report, folder / HELD_OUT)
         summary = done.summary() if done.exit == 0 else None
