@@ -143,7 +143,7 @@ def test_keys_that_are_not_the_sealed_ones_run_nothing(published, tmp_path):
     folder, *_ = published
     keys = folder / "final.seals.keys"
     kept = keys.read_text()
-    keys.write_text(kept.replace(kept.split()[1], "0" * 32))
+    keys.write_text(kept.replace(kept.split()[1], "f" * 32))
     try:
         with pytest.raises(SealError, match="trial 0 is not the one|differs from its commit"):
             sealed_tasks(folder / "final.seals")
