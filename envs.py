@@ -32,24 +32,28 @@ class EnvError(ValueError):
 
 @dataclass(frozen=True)
 class Task:
-    """What gymnasium's environment class adds to the MJCF file.
+    """What gymnasium's environment class adds to the MJCF file; a subclass changes what it must.
 
-    xml, frame_skip: the model and the physics steps per action. skip_root_x: observations leave out qpos[0].
-    clip_velocity: bound on observed qvel. reset_noise: half-width of the uniform start noise; normal_qvel
-    draws qvel from a normal instead. forward_weight, ctrl_weight, healthy_reward: the reward's terms.
-    real: the perturbation that makes the paper's "real" world.
+    xml, frame_skip: the model and the physics steps per action. skip_root_x: how many of the first
+    qpos observations leave out. clip_velocity: bound on observed qvel. reset_noise: half-width of
+    the uniform start noise; normal_qvel draws qvel from a normal instead. forward_weight,
+    ctrl_weight, healthy_reward: the reward's terms; pays_on_end: the last of them is paid for the
+    step that falls too (None: in v4, not in v5). time_limit: steps of an episode (0: gymnasium's
+    1000). real: the perturbation that makes the paper's "real" world.
     """
 
     xml: str
     frame_skip: int
     reset_noise: float
     real: str
-    skip_root_x: bool = True
+    skip_root_x: int = 1
     clip_velocity: float = np.inf
     normal_qvel: bool = False
     forward_weight: float = 1.0
     ctrl_weight: float = 0.0
     healthy_reward: float = 0.0
+    pays_on_end: bool | None = None
+    time_limit: int = 0
 
     def unhealthy(self, qpos, qvel):
         """Which of the states (N, nq), (N, nv) end an episode: (N,) bool."""
@@ -61,6 +65,37 @@ class Task:
             (qpos[:, self.skip_root_x :], np.clip(qvel, -self.clip_velocity, self.clip_velocity)),
             axis=1,
         )
+
+    def state(self, obs, model):
+        """qpos (N, nq) and qvel (N, nv) of observations, what they leave out being 0: the inverse
+        of observe."""
+        position, velocity = np.split(obs, [model.nq - self.skip_root_x], axis=1)
+        return np.pad(position, ((0, 0), (self.skip_root_x, 0))), velocity
+
+    def start(self, rng, model):
+        """qpos (nq,) and qvel (nv,) that an episode begins with, in gymnasium's order of draws."""
+        noise = self.reset_noise
+        qpos = model.qpos0 + rng.uniform(-noise, noise, model.nq)
+        if self.normal_qvel:
+            return qpos, noise * rng.standard_normal(model.nv)
+        return qpos, rng.uniform(-noise, noise, model.nv)
+
+    def place(self, env):
+        """Where each robot is, (N,) m: its speed is what forward_weight pays."""
+        return env.qpos[:, 0].copy()
+
+    def reward(self, env, actions, speed, ended):
+        """The rewards (N,) of a step: actions (N, nu) as the policy chose them, speed (N,) of
+        place(), ended (N,) bool: the episodes that this step terminated."""
+        paid = np.zeros(len(speed))
+        if self.forward_weight:
+            paid += self.forward_weight * speed
+        if self.healthy_reward:
+            on_end = env.env_id.endswith("v4") if self.pays_on_end is None else self.pays_on_end
+            paid += self.healthy_reward if on_end else self.healthy_reward * ~ended
+        if self.ctrl_weight:
+            paid -= self.ctrl_weight * np.square(actions).sum(axis=1)
+        return paid
 
 
 class InvertedPendulum(Task):
@@ -82,7 +117,7 @@ TASKS = {
         2,
         0.01,
         "pole:mass=100",
-        skip_root_x=False,
+        skip_root_x=0,
         forward_weight=0.0,
         healthy_reward=1.0,
     ),
@@ -256,7 +291,7 @@ class BatchEnv(VectorEnv):
             raise EnvError(f"num_envs is {num_envs}: it must be at least 1")
         self.task = task_of(env_id)
         self.env_id, self.num_envs = env_id, num_envs
-        self.spec = gymnasium.spec(env_id)
+        self.spec = gymnasium.spec(env_id) if env_id in gymnasium.registry else None
         nominal = mujoco.MjModel.from_xml_path(str(model_path(env_id)))
         self.model = nominal if model is None else model
         if self.model.nq != nominal.nq or self.model.nu < nominal.nu:
@@ -268,19 +303,16 @@ class BatchEnv(VectorEnv):
         self.frame_skip = max(
             1, round(self.dt / self.model.opt.timestep)
         )  # a given model may take finer steps
-        # v4 pays for the step that falls, v5 does not
-        self._pays_on_end = env_id.endswith("v4")
-
         self.batch = Batch(self.model, num_envs, nthread)
         self.qpos, self.qvel, ctrl = (self.batch.bind(field) for field in ("qpos", "qvel", "ctrl"))
         self._ctrl = ctrl[:, : nominal.nu]
         self._peek = None
-        self._init_qpos = self.model.qpos0.copy()
         self._rng = [None] * num_envs
         self.steps = np.zeros(num_envs, int)
         self.counterfactual_steps = 0
 
-        nobs = self.model.nq + self.model.nv - self.task.skip_root_x
+        self.task.place(self)  # what it reads is copied out of the batch from now on
+        nobs = self.observe().shape[1]
         low, high = nominal.actuator_ctrlrange.astype(np.float32).T
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (nobs,), np.float64)
         self.single_action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
@@ -304,14 +336,8 @@ class BatchEnv(VectorEnv):
 
     def _restart(self, ids):
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        noise = self.task.reset_noise
         for i in ids:
-            rng = self._rng[i]
-            self.qpos[i] = self._init_qpos + rng.uniform(-noise, noise, self.model.nq)
-            if self.task.normal_qvel:
-                self.qvel[i] = noise * rng.standard_normal(self.model.nv)
-            else:
-                self.qvel[i] = rng.uniform(-noise, noise, self.model.nv)
+            self.qpos[i], self.qvel[i] = self.task.start(self._rng[i], self.model)
         self.batch.forward(ids)
         self.steps[ids] = 0
 
@@ -331,15 +357,16 @@ class BatchEnv(VectorEnv):
             raise EnvError(
                 f"actions have shape {actions.shape}: {self.env_id} takes {self.action_space.shape}"
             )
-        x_before = self.qpos[:, 0].copy()
+        before = self.task.place(self)
         self._ctrl[:] = actions if applied is None else applied
         self.batch.step(nstep=self.frame_skip)
         lost = self._unstable(self.batch)
         self.steps += 1
 
         terminated = self.task.unhealthy(self.qpos, self.qvel) | lost
-        truncated = self.steps >= TIME_LIMIT
-        reward = self._reward(actions, (self.qpos[:, 0] - x_before) / self.dt, terminated)
+        truncated = self.steps >= (self.task.time_limit or TIME_LIMIT)
+        speed = (self.task.place(self) - before) / self.dt
+        reward = self.task.reward(self, actions, speed, terminated)
         next_obs = self.observe()
         reward[lost], next_obs[lost] = 0.0, self.obs[lost]
         info = {"next_obs": next_obs}
@@ -361,10 +388,10 @@ class BatchEnv(VectorEnv):
         What an observation leaves out is set to 0 (root x) or taken as it stands (a clipped velocity). The
         environment must be reset afterwards.
         """
-        nq = self.model.nq
-        position, velocity = np.split(obs, [nq - self.task.skip_root_x], axis=1)
+        qpos, qvel = self.task.state(obs, self.model)
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        self.qpos[:, self.task.skip_root_x :], self.qvel[:] = position, velocity
+        self.qpos[:, self.task.skip_root_x :] = qpos[:, self.task.skip_root_x :]
+        self.qvel[:] = qvel
         self.batch.forward()
         self.obs = self.observe()
         self._ctrl[:] = applied(self.obs) if callable(applied) else applied
@@ -382,19 +409,6 @@ class BatchEnv(VectorEnv):
         self.counterfactual_steps += self.num_envs
         after = self.task.observe(self._peek.qpos, self._peek.qvel)
         return np.where(self._unstable(self._peek)[:, None], self.observe(), after)
-
-    def _reward(self, actions, x_velocity, terminated):
-        task = self.task
-        reward = np.zeros(self.num_envs)
-        if task.forward_weight:
-            reward += task.forward_weight * x_velocity
-        if task.healthy_reward:
-            reward += (
-                task.healthy_reward if self._pays_on_end else task.healthy_reward * ~terminated
-            )
-        if task.ctrl_weight:
-            reward -= task.ctrl_weight * np.square(actions).sum(axis=1)
-        return reward
 
     def _unstable(self, batch):
         """Which rows of a batch became unstable in its last steps: (N,) bool. Raises EnvError where all did."""

@@ -301,7 +301,19 @@ def pretrained(s, world, env, steps, bar):
     """TRPO from scratch in a world, "sim" or "real": the learner's state. Runs that name one --pretrained folder share it."""
     changes = s.real if world == "real" else ""
     known = {k: v for k, v in versions().items() if k != "grounding"}
-    decides = [s.env, changes, s.policy, s.seed, steps, s.num_envs, s.threads, s.target, known]
+    task = Path(s.task).read_text() if s.task else ""
+    decides = [
+        s.env,
+        task,
+        changes,
+        s.policy,
+        s.seed,
+        steps,
+        s.num_envs,
+        s.threads,
+        s.target,
+        known,
+    ]
     key = hashlib.sha256(repr(decides).encode()).hexdigest()[:16]
     folder = Path(s.pretrained) if s.pretrained else bar.run.folder
     path = folder / f"{s.env}-{world}-{key}.pt"

@@ -375,7 +375,7 @@ def test_an_unstable_step_ends_that_robots_episode_alone():
     np.testing.assert_array_equal(terminated, [False, False, True, False])
     assert reward[2] == 0 and not truncated.any()
     np.testing.assert_array_equal(info["next_obs"][2], before[2])
-    assert np.abs(obs[2] - env._init_qpos[[*range(1, 6), *[0] * 6]]).max() < 2
+    assert np.abs(obs[2] - env.model.qpos0[[*range(1, 6), *[0] * 6]]).max() < 2
     expected = twin.step(a)
     np.testing.assert_array_equal(obs[others], expected[0][others])
     np.testing.assert_array_equal(reward[others], expected[1][others])

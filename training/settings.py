@@ -1,15 +1,17 @@
 """What decides a run's numbers: the settings of the command line, the presets that fill them in, and the seeds."""
 
 import dataclasses
+import importlib.util
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from envs import model_path, parse_perturbation, perturb, task_of
+from envs import ENV_IDS, TASKS, BatchEnv, model_path, parse_perturbation, perturb, task_of
 from rgat import AT_CONFIG, METHODS, GroundingSettings
 from training.run_folder import RunError
-from trpo import PRESETS, STABLE_BASELINES
+from trpo import PRESETS, STABLE_BASELINES, TRPOConfig
 
 ALGOS = [*METHODS, "physics", "physics+rgat", "physics+solved"]
 
@@ -63,6 +65,9 @@ class Settings:
     """Everything that decides a run's numbers, but for --out."""
 
     env: str = option("Hopper-v4", "task: InvertedPendulum, Hopper or HalfCheetah, -v4 or -v5")
+    task: str = option(
+        "", "a Python file that defines another TASK (see training/tasks), for --env"
+    )
     algo: str = option(
         "rgat",
         "how to ground: rgat, gat, ane, oracle, solved (rgat's transformer with a label instead of a reward), "
@@ -156,16 +161,21 @@ class Settings:
     )
 
     @property
-    def task(self):
+    def robot(self):
         return self.env.split("-")[0]
 
     def completed(self):
         """These settings with the preset's and the task's defaults filled in. Raises EnvError or RunError for impossible ones."""
+        if self.task:
+            return dataclasses.replace(self, env=load_task(self.task))._filled()
+        return self._filled()
+
+    def _filled(self):
         real, preset = task_of(self.env).real, PRESET[self.preset]
         defaults = {
-            **DEFAULTS[self.task],
+            **DEFAULTS[self.robot],
             **preset,
-            "at_std": preset["at_std"][self.task],
+            "at_std": preset["at_std"].get(self.robot, preset["at_std"]["Hopper"]),
             "real": real,
             "real_trajectories": 1 if self.algo.startswith("physics") else 50,
         }
@@ -221,7 +231,45 @@ class Settings:
     @property
     def target(self):
         """TRPOConfig of the target policy."""
-        return STABLE_BASELINES if self.preset == "paper" else PRESETS[self.task]
+        return STABLE_BASELINES if self.preset == "paper" else PRESETS[self.robot]
+
+
+def load_task(path):
+    """Make the TASK of a user's file known under the file's name, which is returned.
+
+    The file may also define DEFAULTS, settings that suit the task, and LEARNER, the TRPOConfig of
+    its policy. Raises RunError, in one line, for a file that is none or a task that does not work.
+    """
+    path = Path(path)
+    name = path.stem
+    try:
+        spec = importlib.util.spec_from_file_location(f"task_{name}", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        task = dataclasses.replace(module.TASK, xml=str((path.parent / module.TASK.xml).resolve()))
+        TASKS[name] = task
+        ENV_IDS.append(name) if name not in ENV_IDS else None
+        PRESETS[name] = getattr(module, "LEARNER", TRPOConfig())
+        DEFAULTS[name] = {"grounding_steps": 10, **LARGE, **getattr(module, "DEFAULTS", {})}
+        env = BatchEnv(name, 2, nthread=1)
+        first = env.reset(seed=0)[0]
+        obs, reward, *_ = env.step(np.zeros(env.action_space.shape))
+    except Exception as error:  # whatever a user's file raises
+        said = str(error).splitlines()
+        raise RunError(
+            f"--task {path}: {type(error).__name__}{': ' * bool(said)}{(said or [''])[0]}"
+        ) from None
+    if not np.isfinite(first).all() or not np.isfinite(obs).all():
+        raise RunError(f"--task {path}: observe() returns NaN or infinite values")
+    if np.shape(reward) != (2,) or not np.isfinite(reward).all():
+        raise RunError(f"--task {path}: reward() must return a finite number per robot, (N,)")
+    qpos, qvel = task.state(obs, env.model)
+    if (qpos.shape, qvel.shape) != ((2, env.model.nq), (2, env.model.nv)):
+        raise RunError(
+            f"--task {path}: state() makes qpos {qpos.shape[1:]} and qvel {qvel.shape[1:]} of an "
+            f"observation, the model has {env.model.nq} and {env.model.nv}: it must undo observe()"
+        )
+    return name
 
 
 COUNTS = {
