@@ -34,7 +34,8 @@ MJCF = """
 <body pos=".3 0 0"><joint name="elbow" axis="0 0 1"/>
 <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
 </body></body></worldbody>
-<actuator><motor joint="shoulder" ctrlrange="-1 1"/><motor joint="elbow" ctrlrange="-1 1"/></actuator>
+<actuator><motor joint="shoulder" ctrlrange="-1 1"/>
+<motor joint="elbow" ctrlrange="-1 1"/></actuator>
 </mujoco>"""
 
 
