@@ -88,21 +88,23 @@ SEPARATING = [
     ),
     (
         {"load_friction", "coulomb_friction", "friction_map", "coupled_friction"},
-        "repeat one slow motion through the whole travel, without and with a weight hung on: friction "
-        "that follows the load grows with it, a map stays where it is",
+        "repeat one slow motion through the whole travel, without and with a weight hung on: "
+        "friction that follows the load grows with it, a map stays where it is",
     ),
     (
         {"coupled_friction", "coupled_inertia", "armature", "viscous_damping"},
-        "hold one of the two joints fast and move the other: what couples them shows at the held one",
+        "hold one of the two joints fast and move the other: what couples them shows at the held "
+        "one",
     ),
     (
         {"presliding", "coulomb_friction", "stribeck_friction", "stiffness"},
-        "push gently, without breaking loose, and let go: presliding springs back, friction does not",
+        "push gently, without breaking loose, and let go: presliding springs back, friction stays "
+        "put",
     ),
     (
         {"joint_elasticity", "backlash", "delay", "lag"},
-        "hold the link fast and turn the motor a little both ways: elasticity gives in proportion to "
-        "the torque, backlash at once and then no more, a delay not at all",
+        "hold the link fast and turn the motor a little both ways: elasticity gives in proportion "
+        "to the torque, backlash at once and then no more, a delay not at all",
     ),
     (
         {"servo_stiffness", "gain", "stiffness", "spring_offset"},
