@@ -253,7 +253,7 @@ def _checked(args):
     if args.next is not None:
         others = (args.model, args.env, args.recordings, args.out)
         if any(value is not None for value in others):
-            raise ModelError("--next REPORT: takes --seconds and nothing else")
+            raise ModelError("--next REPORT: takes --seconds, --kp and --kd, nothing else")
         if not 1 <= args.seconds <= 120:
             raise ModelError(f"--seconds {args.seconds:g}: give 1 to 120")
         return args
@@ -348,7 +348,8 @@ def main(argv=None):
         args = _checked(_parser().parse_args(argv))
         if args.next:
             with quiet():
-                print(write_next(args.next, args.seconds))
+                gains = (gain_words(f"--{name}", getattr(args, name)) for name in ("kp", "kd"))
+                print(write_next(args.next, args.seconds, *gains))
             return 0
         with quiet():
             if sys.stderr.isatty():

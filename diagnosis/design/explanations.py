@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from diagnosis.nominal.model import ModelError, load_world
+from diagnosis.nominal.model import ModelError, gains_of, load_world, with_gains
 from diagnosis.recordings.columns import WIDTHS, columns_of
+from diagnosis.recordings.layout import is_servo, joint_of
 from diagnosis.simulation.simulator import World
 
 STILL = 5.0  # noises: a joint that moved less never moved
@@ -28,8 +29,11 @@ class DesignError(ValueError):
 
 @dataclass(frozen=True)
 class Limits:
-    """What an excitation may do. low, high, speed (n,): of hinges and slides; control_low,
-    control_high (nu,): of the controls; period: s between rows."""
+    """What an excitation may do.
+
+    low, high, speed (n,): of hinges and slides; control_low, control_high (nu,): of the controls;
+    period: s between rows; start_qpos (nq,), start_ctrl (nu,): where it begins and ends, at rest.
+    """
 
     low: np.ndarray
     high: np.ndarray
@@ -37,6 +41,8 @@ class Limits:
     control_low: np.ndarray
     control_high: np.ndarray
     period: float
+    start_qpos: np.ndarray
+    start_ctrl: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,7 @@ class Open:
     world: the nominal model. names, settings: explanations, the first being the report's own.
     free: [Candidate] that only motion not recorded yet would show, at their nominal values.
     noise (n,): of hinges and slides. limits: what was reached, and what the model allows.
+    followed: joints whose motors were given position controllers meanwhile.
     """
 
     world: World
@@ -54,10 +61,12 @@ class Open:
     free: tuple
     noise: np.ndarray
     limits: Limits
+    followed: tuple = ()
 
     @classmethod
-    def read(cls, folder: str) -> "Open":
-        """From a report's folder. Raises DesignError."""
+    def read(cls, folder: str, kp=None, kd=None) -> "Open":
+        """From a report's folder. kp, kd: gains of position controllers that the motors are given
+        meanwhile, one number or {joint: number}. Raises DesignError."""
         summary = _json(os.path.join(folder, "diagnosis.json"), "findings")
         reached = _json(os.path.join(folder, "recorded.json"), "columns")
         path = os.path.join(folder, "nominal.xml")
@@ -67,6 +76,8 @@ class Open:
             )
         try:
             world = load_world(path)
+            gains = gains_of({"kp": kp, "kd": kd}, world.model)
+            world = with_gains(world, gains)
         except ModelError as error:
             raise DesignError(error) from None
         names, settings = _explanations(world, summary)
@@ -77,7 +88,15 @@ class Open:
         free = tuple(
             c for c in world.candidates if c.effect.name in RUBBING and c.place.name in still
         )
-        return cls(world, names, settings, free, noise, limits_of(world.model, reached))
+        return cls(
+            world,
+            names,
+            settings,
+            free,
+            noise,
+            limits_of(world.model, reached, gains),
+            tuple(gains),
+        )
 
 
 def single(model: mujoco.MjModel) -> list[str]:
@@ -87,13 +106,15 @@ def single(model: mujoco.MjModel) -> list[str]:
 
 def reached_by(recordings, model: mujoco.MjModel) -> dict:
     """What recordings reached, for recorded.json: {"columns": {name: [low, high]}, "speeds":
-    {joint: largest}, "period": s}."""
-    columns, speeds = {}, {}
+    {joint: largest}, "period": s, "start": {name: value in the first row}}."""
+    columns, speeds, start = {}, {}, {}
     for column, (kind, k) in columns_of(model).items():
         if kind in ("qpos", "ctrl"):
             values = np.concatenate([getattr(r, kind)[:, k] for r in recordings])
             if np.isfinite(values).any():
                 columns[column] = [float(np.nanmin(values)), float(np.nanmax(values))]
+                first = getattr(recordings[0], kind)[0, k]
+                start[column] = float(first) if np.isfinite(first) else None
     for joint in single(model):
         q = model.jnt_qposadr[model.joint(joint).id]
         rates = []
@@ -104,27 +125,53 @@ def reached_by(recordings, model: mujoco.MjModel) -> dict:
         if len(rates):
             speeds[joint] = float(np.quantile(rates, 0.995))
     period = float(np.median(np.concatenate([np.diff(r.time) for r in recordings])))
-    return {"columns": columns, "speeds": speeds, "period": period}
+    return {"columns": columns, "speeds": speeds, "period": period, "start": start}
 
 
-def limits_of(model: mujoco.MjModel, reached: dict) -> Limits:
-    """The Limits of a model whose recordings reached {"columns", "speeds", "period"}."""
-    low, high, speed = [], [], []
+def limits_of(model: mujoco.MjModel, reached: dict, followed=()) -> Limits:
+    """The Limits of a model whose recordings reached {"columns", "speeds", "period", "start"}.
+
+    followed: joints whose motors were given position controllers since.
+    """
+    low, high, speed = {}, {}, {}
+    qpos, ctrl = _start(model, reached, followed)
+    usual = max(reached["speeds"].values(), default=1.0)
     for joint in single(model):
-        j = model.joint(joint).id
+        j, at = model.joint(joint).id, qpos[model.joint(joint).qposadr[0]]
         first, last = reached["columns"].get(f"qpos:{joint}", (0.0, 0.0))
         more = BEYOND * (last - first)
         span = model.jnt_range[j] if model.jnt_limited[j] else (first - more, last + more)
-        low.append(span[0] + SLACK * (span[1] - span[0]))
-        high.append(span[1] - SLACK * (span[1] - span[0]))
-        usual = max(reached["speeds"].values(), default=1.0)
-        speed.append(max(reached["speeds"].get(joint, 0.0), 0.2 * usual) * (1 + BEYOND))
+        low[joint] = min(at, span[0] + SLACK * (span[1] - span[0]))
+        high[joint] = max(at, span[1] - SLACK * (span[1] - span[0]))
+        speed[joint] = max(reached["speeds"].get(joint, 0.0), 0.2 * usual) * (1 + BEYOND)
     span = model.actuator_ctrlrange.copy()
     for name, (kind, k) in columns_of(model).items():
         if kind == "ctrl" and not model.actuator_ctrllimited[k]:
             span[k] = reached["columns"].get(name, (0.0, 0.0))
-    every = (np.array(values, dtype=float) for values in (low, high, speed))
-    return Limits(*every, span[:, 0], span[:, 1], reached["period"])
+    for a in range(model.nactuator):
+        if joint_of(model, a) in followed:
+            span[model.actuator_ctrladr[a]] = low[joint_of(model, a)], high[joint_of(model, a)]
+    every = (np.array(list(x.values()), dtype=float) for x in (low, high, speed))
+    ctrl = np.clip(ctrl, span[:, 0], span[:, 1])
+    return Limits(*every, span[:, 0], span[:, 1], reached["period"], qpos, ctrl)
+
+
+def _start(model, reached, followed):
+    """(qpos (nq,), ctrl (nu,)) with which the first recording began, or of the reference pose."""
+    start = reached.get("start") or {}
+    qpos, ctrl = model.qpos0.copy(), np.zeros(model.nu)
+    known = columns_of(model)
+    for name, (kind, k) in known.items():
+        if kind == "qpos" and start.get(name) is not None:
+            qpos[k] = start[name]
+    for a in range(model.nactuator):
+        joint, name = joint_of(model, a), f"ctrl:{model.actuator(a).name}"
+        if joint is not None and is_servo(model, a):
+            gear = 1.0 if joint in followed else model.actuator_gear[a, 0]
+            ctrl[model.actuator_ctrladr[a]] = gear * qpos[model.joint(joint).qposadr[0]]
+        if joint not in followed and start.get(name) is not None and name in known:
+            ctrl[known[name][1]] = start[name]
+    return qpos, ctrl
 
 
 def _json(path, key):

@@ -15,7 +15,6 @@ import numpy as np
 
 from diagnosis.design import signals
 from diagnosis.design.explanations import DesignError, Open, single
-from diagnosis.recordings.layout import is_servo, joint_of
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import Window
 
@@ -31,10 +30,9 @@ class Excitation:
     """The best excitation and what is expected of it.
 
     time (T,) s; ctrl (T, nu); motions (H, T, n): of hinges and slides under each explanation;
-    names: theirs. nats: logarithm
-    of the ratio of evidence between the nearest two, None where there is one. errors: {"effect at
-    place: parameter": (value,
-    standard error that the recording would leave)}.
+    names: theirs. nats: logarithm of the ratio of evidence between the nearest two, None where
+    there is one. errors: {"effect at place: parameter": (value, standard error that the recording
+    would leave, unit)}. start_qpos (nq,): where it starts, at rest.
     """
 
     time: np.ndarray
@@ -43,6 +41,7 @@ class Excitation:
     names: tuple
     nats: float | None
     errors: dict
+    start_qpos: np.ndarray
 
 
 def design(left: Open, seconds: float = 10.0, seed: int = 0) -> Excitation:
@@ -53,19 +52,19 @@ def design(left: Open, seconds: float = 10.0, seed: int = 0) -> Excitation:
         )
     rng, limits = np.random.default_rng(seed), left.limits
     trial, time = Trial(left), np.arange(0.0, seconds, limits.period)
-    middle = np.clip(trial.rest, limits.control_low, limits.control_high)
     span = limits.control_low, limits.control_high
     pool = []
     for _ in range(ROUNDS):
-        ideas = [signals.drawn(rng, time, *span, middle) for _ in range(DRAWN)]
+        ideas = [signals.drawn(rng, time, *span, limits.start_ctrl) for _ in range(DRAWN)]
         if pool:
             pick = lambda: pool[rng.integers(len(pool))][1]
             ideas = [signals.changed(rng, pick(), pick(), idea, *span) for idea in ideas]
         pool = sorted([*pool, *trial.judged(time, ideas)], key=lambda item: -item[0])[:KEPT]
     if not pool:
         raise DesignError(
-            "every excitation left the joints' ranges or the speeds that were recorded; record "
-            "with more room first"
+            "every excitation left the joints' ranges or the speeds that were recorded; an arm "
+            "that falls when its torques are a little wrong needs position targets: give --kp and "
+            "--kd"
         )
     if len(left.settings) == 1:
         return trial.described(time, pool[0][1])
@@ -78,16 +77,10 @@ class Trial:
     """Simulates excitations under what a report left open."""
 
     def __init__(self, left: Open):
-        self.left, self.world = left, left.world
+        self.left, self.world, self.start = left, left.world, left.limits.start_qpos
         self.model = model = left.world.model
         self.columns = [model.jnt_qposadr[model.joint(j).id] for j in single(model)]
         self.speeds = [model.jnt_dofadr[model.joint(j).id] for j in single(model)]
-        self.rest = np.zeros(model.nu)
-        for a in range(model.nactuator):
-            joint = joint_of(model, a)
-            if joint is not None and is_servo(model, a):
-                place = model.qpos0[model.jnt_qposadr[model.joint(joint).id]]
-                self.rest[model.actuator_ctrladr[a]] = model.actuator_gear[a, 0] * place
 
     def judged(self, time, ideas):
         """[(score, ctrl (T, nu))] of the ideas that stay within the limits, some made smaller."""
@@ -113,7 +106,7 @@ class Trial:
     def _recording(self, time, ctrl):
         """A recording of nothing but controls."""
         rows = len(time)
-        still = np.tile(self.model.qpos0, (rows, 1)), np.zeros((rows, self.model.nv))
+        still = np.tile(self.start, (rows, 1)), np.zeros((rows, self.model.nv))
         return Recording("next", time, *still, ctrl)
 
     def _motions(self, recordings):
@@ -122,7 +115,7 @@ class Trial:
         count, settings = len(self.left.settings), self.left.settings
         windows = [Window(r, 0, len(r.time) - 1) for r in recordings for _ in settings]
         starts = (
-            np.tile(self.model.qpos0, (len(windows), 1)),
+            np.tile(self.start, (len(windows), 1)),
             np.zeros((len(windows), self.model.nv)),
         )
         qpos, qvel = self.world.simulate(list(settings) * len(recordings), *starts, windows)
@@ -240,4 +233,4 @@ class Trial:
             name = f"{candidate.effect} at {candidate.place.name}: {parameter.name}"
             errors[name] = value, error, parameter.unit
         motions = motion[0][..., self.columns]
-        return Excitation(time, ctrl, motions, self.left.names, nats, errors)
+        return Excitation(time, ctrl, motions, self.left.names, nats, errors, self.start)

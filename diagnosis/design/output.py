@@ -9,25 +9,29 @@ import numpy as np
 from diagnosis.common.atomic_files import write_together
 from diagnosis.design.explanations import Open, single
 from diagnosis.design.optimal import Excitation, design
+from diagnosis.recordings.layout import joint_of
 
 
-def write_next(folder: str, seconds: float) -> str:
+def write_next(folder: str, seconds: float, kp=None, kd=None) -> str:
     """Design the next recording of a report's folder, write next.csv and, where matplotlib is
     installed, next.png there; what to say of them. Raises DesignError, WriteError."""
-    left = Open.read(folder)
+    left = Open.read(folder, kp, kd)
     best = design(left, seconds)
-    files = {"next.csv": table(best, left.world.model)}
+    files = {"next.csv": table(best, left.world.model, left.followed)}
     if importlib.util.find_spec("matplotlib"):
         files["next.png"] = picture(best, left.world.model)
     write_together({os.path.join(folder, name): data for name, data in files.items()})
     drawn = os.path.join(folder, "next.png")
     drawn = drawn if "next.png" in files else "a picture needs the extra [next], matplotlib"
-    return words(best, os.path.join(folder, "next.csv"), drawn)
+    return words(best, left.world.model, os.path.join(folder, "next.csv"), drawn)
 
 
-def table(best: Excitation, model) -> str:
-    """CSV of time and controls."""
-    names = [f"ctrl:{model.actuator(a).name}" for a in range(model.nu)]
+def table(best: Excitation, model, followed=()) -> str:
+    """CSV of time and controls, or of targets for the joints `followed`."""
+    names = []
+    for a in range(model.nu):
+        joint = joint_of(model, a) if a < model.nactuator else None
+        names.append(f"target:{joint}" if joint in followed else f"ctrl:{model.actuator(a).name}")
     rows = np.column_stack([best.time, best.ctrl])
     lines = [",".join(["time", *names])]
     return "\n".join(lines + [",".join(f"{x:.9g}" for x in row) for row in rows]) + "\n"
@@ -40,11 +44,15 @@ def ratio(nats: float) -> str:
     return "over a billion to one" if nats > 9 * np.log(10) else f"{np.exp(nats):.2g} to one"
 
 
-def words(best: Excitation, file: str, drawn: str) -> str:
+def words(best: Excitation, model, file: str, drawn: str) -> str:
     """What to do, and what is expected of it."""
+    joints = single(model)
+    columns = [model.jnt_qposadr[model.joint(joint).id] for joint in joints]
+    places = zip(joints, best.start_qpos[columns])
+    at = ", ".join(f"{joint} {place:.3g}" for joint, place in places)
     lines = [
-        f"Record this next: {best.time[-1] + best.time[1]:.3g} s of controls in {file}, started at "
-        "rest in the model's reference pose."
+        f"Record this next: {best.time[-1] + best.time[1]:.3g} s of controls in {file}, from rest "
+        f"where the first recording began ({at})."
     ]
     if best.nats is not None:
         lines += [

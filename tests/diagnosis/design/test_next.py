@@ -13,6 +13,7 @@ from diagnosis import command
 from diagnosis.design import signals
 from diagnosis.design.explanations import DesignError, Open, limits_of, reached_by
 from diagnosis.design.optimal import Trial, design
+from diagnosis.design.output import table
 from diagnosis.recordings.recording import Recording
 
 MODEL = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
@@ -127,6 +128,23 @@ def test_a_joint_that_never_moved_is_moved(tmp_path, old):
     (tmp_path / "report" / "recorded.json").write_text(json.dumps(reached))
     left = Open.read(folder)
     assert {c.effect.name for c in left.free} == {"coulomb_friction", "viscous_damping", "armature"}
+
+
+def test_motors_may_be_given_position_controllers_meanwhile(tmp_path, old):
+    folder = report(tmp_path / "report", old, [finding("coulomb_friction", "frictionloss", 0.03)])
+    left = Open.read(folder, kp=5.0, kd=0.2)
+    best = design(left, seconds=2.0)
+    assert table(best, left.world.model, left.followed).startswith("time,target:pivot\n")
+    assert left.limits.low[0] <= best.ctrl.min() and best.ctrl.max() <= left.limits.high[0]
+    assert best.ctrl[0] == best.start_qpos[0] == 0.0
+    assert np.abs(best.motions[0, :, 0] - best.ctrl[:, 0]).max() < 1.0  # it follows its targets
+
+
+def test_it_starts_where_the_first_recording_did():
+    reached = {"columns": {"qpos:pivot": [-0.1, 0.1]}, "speeds": {"pivot": 2.0}, "period": DT}
+    reached["start"] = {"qpos:pivot": 0.7, "ctrl:drive": 0.9}
+    limits = limits_of(mujoco.MjModel.from_xml_string(MODEL), reached)
+    assert (limits.start_qpos[0], limits.start_ctrl[0]) == (0.7, 0.9) and limits.high[0] >= 0.7
 
 
 def test_limits():
