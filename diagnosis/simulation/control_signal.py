@@ -28,7 +28,8 @@ class Signal:
         """What the actuator sees in each of `count` steps of `step` seconds from time `start`,
         (count,).
 
-        As passed(), but for what it tires."""
+        As passed(), but for what it tires. start may be an array (n, 1) of times: then (n, count).
+        """
         seen = self.passed(start, step, count, average)
         if self.tires:
             begins = start + step * np.arange(count)
@@ -46,9 +47,11 @@ class Signal:
         or the filter's mean over the step if `average` (a Runge-Kutta step sees the filter move).
         """
         if np.isfinite(self.rate):
-            return self._followed(start, step, count, average)
+            each = [self._followed(float(t), step, count, average) for t in np.ravel(start)]
+            return np.array(each).reshape(*np.shape(start)[:-1], count)
         edges = start - self.delay + step * np.arange(count + 1)
-        first, last = self._row(edges[:-1] + SLACK * step), self._row(edges[1:] - SLACK * step)
+        first = self._row(edges[..., :-1] + SLACK * step)
+        last = self._row(edges[..., 1:] - SLACK * step)
         held = self.value[first]
         if (first != last).any() or self.lag:
             mean = np.diff(self.integral(edges)) / step
@@ -56,7 +59,7 @@ class Signal:
         if not self.lag:
             return held
         if not average:
-            return replace(self, lag=end_of_step(self.lag, step)).filtered(edges)[1:]
+            return replace(self, lag=end_of_step(self.lag, step)).filtered(edges)[..., 1:]
         act = self.filtered(edges)
         return held - self.lag / step * np.diff(act)
 

@@ -217,9 +217,7 @@ class World:
         start_qpos, start_qvel = np.asarray(start_qpos, float), np.asarray(start_qvel, float)
         with quiet():
             for (structure, step, *_), members in groups.items():
-                if structure not in self._engines:
-                    self._engines[structure] = Engine(self.spec, self.model, structure)
-                engine = self._engines[structure]
+                engine = self.engine(structure)
                 duration = max(
                     r.time[last] - r.time[first]
                     for r, first, last in (windows[s] for s, _ in members)
@@ -242,6 +240,12 @@ class World:
                     for whole, part in zip(out, run):
                         whole[ids] = part
         return tuple(out) if sensors else tuple(out[:2])
+
+    def engine(self, structure):
+        """The Engine for a frozenset of the candidates that need parts of their own, made once."""
+        if structure not in self._engines:
+            self._engines[structure] = Engine(self.spec, self.model, structure)
+        return self._engines[structure]
 
     def corrected_xml(self, setting):
         """The model with the effects of a setting, as MJCF for stock MuJoCo.

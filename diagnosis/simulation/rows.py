@@ -1,0 +1,165 @@
+"""One recorded row ahead, from any state at its beginning, for all rows of recordings in one call.
+
+rows = RowMap(world, recordings, {friction: (0.1,)})
+qpos, qvel = rows.ahead(rows.begin, qpos, qvel, force)
+"""
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from diagnosis.effects.base import runge_kutta
+from diagnosis.estimation.windows import difference, integrate
+from diagnosis.simulation.batch import threads
+from diagnosis.simulation.control_signal import SLACK
+from diagnosis.simulation.simulator import Case
+
+FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+INPUT = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+CHUNK = 40000  # simulations in memory at a time
+SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per second, of the force
+
+
+class RowMap:
+    """Simulates every row of some recordings under a setting, with a constant extra force in each.
+
+    Effects that add coordinates of their own (backlash) or act under a condition are left out, for
+    a row's states are those of the nominal model's coordinates alone.
+
+    begin: the rows (n,) that have a next one, counted through all recordings; seconds (n,).
+    """
+
+    def __init__(self, world, recordings, setting):
+        self.world, self.recordings, self.nominal = world, recordings, world.model
+        setting = {c: v for c, v in setting.items() if c.effect.name != "backlash" and not c.when}
+        self.case = case = Case(world.model, setting, 1)
+        self.working = world.engine(case.structure).working
+        model = self.working.edited(case.on, case.step)
+        if model is None:
+            raise ValueError("MuJoCo refuses these values")
+        self.model = model
+        time = [r.time for r in recordings]
+        first = np.cumsum([0] + [len(t) for t in time])
+        self.begin = np.concatenate(
+            [np.arange(a, b - 1) for a, b in zip(first[:-1], first[1:])]
+        ).astype(int)
+        self.seconds = np.concatenate([np.diff(t) for t in time])
+        self.count = max(1, int(np.ceil(self.seconds.max() / case.step - SLACK)))
+        self.control = np.concatenate([self._controls(r) for r in recordings])
+        self.activation = self._activations()
+
+    def _controls(self, recording):
+        """(rows - 1, count, nu): what the actuators see in the steps after each row."""
+        model, average = self.nominal, runge_kutta(self.nominal)
+        start, out = recording.time[:-1, None], np.zeros((len(recording.time) - 1, self.count, model.nu))
+        for a in range(model.nactuator):
+            u = model.actuator_ctrladr[a]
+            for k in range(u, u + model.actuator_ctrlnum[a]):
+                signal = self.working.signal(recording, a, k)
+                for c, values in self.case.on:
+                    if c.place.kind == "actuator" and c.place.name == model.actuator(a).name:
+                        signal = c.effect.command(signal, model, a, values)
+                out[:, :, k] = signal.sample(start, self.case.step, self.count, average)
+        return out
+
+    def _activations(self):
+        if not self.model.na:
+            return np.zeros((len(self.begin), 0))
+        return np.array(
+            [self.working.activation(r, t) for r in self.recordings for t in r.time[:-1]]
+        )
+
+    def ahead(self, index, qpos, qvel, force):
+        """States after rows `index` (n,) of `begin` from states (n, nq), (n, nv) under force (n, nv).
+
+        Returns qpos (n, nq), qvel (n, nv), and whether something touched in the row (n,).
+        """
+        n, m = len(index), self.model
+        out_q, out_v = np.empty((n, m.nq)), np.empty((n, m.nv))
+        held = force + self._forces(index, qpos, qvel)
+        for a in range(0, n, CHUNK):
+            part = slice(a, a + CHUNK)
+            out_q[part], out_v[part] = self._rollout(
+                index[part], qpos[part], qvel[part], held[part]
+            )
+        return out_q, out_v
+
+    def _rollout(self, index, qpos, qvel, force):
+        m, n = self.model, len(index)
+        state = np.concatenate([np.zeros((n, 1)), qpos, qvel, self.activation[index]], 1)
+        control = np.concatenate(
+            [self.control[index], np.repeat(force[:, None], self.count, 1)], 2
+        )
+        number = threads() or 2
+        path, _ = rollout.rollout(
+            m,
+            [mujoco.MjData(m) for _ in range(number)],
+            state,
+            control,
+            control_spec=INPUT,
+            nstep=self.count,
+        )
+        path = np.concatenate([state[:, None], path], 1)
+        x = self.seconds[index] / self.case.step
+        k = np.clip(np.floor(x + SLACK).astype(int), 0, self.count)
+        f = np.where(abs(x - k) <= 1.5 * SLACK, 0.0, x - k)[:, None]
+        rows, after = np.arange(n), np.minimum(k + 1, self.count)
+        here, there = path[rows, k], path[rows, after]
+        q0, q1 = here[:, 1 : 1 + m.nq], there[:, 1 : 1 + m.nq]
+        v0, v1 = (x[:, 1 + m.nq : 1 + m.nq + m.nv] for x in (here, there))
+        return integrate(m, q0, f * difference(m, q0, q1)), v0 + f * (v1 - v0)
+
+    def _forces(self, index, qpos, qvel):
+        """(n, nv): forces of the setting's effects that depend on the state, as at the row's beginning."""
+        n, out = len(index), np.zeros((len(index), self.model.nv))
+        xfrc = np.zeros((self.model.nbody, 6))
+        constant = np.zeros(self.model.nv)
+        for c, values in self.case.on:
+            i = c.effect.id(self.model, c.place.name)
+            c.effect.push(constant, xfrc, self.model, i, values)
+            if c.effect.overrides("force"):
+                own = np.tile(np.array(values, float), (n, 1))
+                function = c.effect.force([self.model] * n, i, own)
+                if function is not None:
+                    time = np.concatenate([r.time[:-1] for r in self.recordings])[index]
+                    out += function(qpos, qvel, self.control[index, 0], time)
+        out += constant
+        return out + self._pushed(xfrc, qpos) if xfrc.any() else out
+
+    def _pushed(self, xfrc, qpos):
+        """(n, nv): constant forces on bodies as forces in the joints."""
+        data, out = mujoco.MjData(self.model), np.zeros((len(qpos), self.model.nv))
+        for row, q in zip(out, qpos):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(self.model, data)
+            mujoco.mj_comPos(self.model, data)
+            for body in np.flatnonzero(xfrc.any(1)):
+                mujoco.mj_applyFT(
+                    self.model, data, xfrc[body, :3], xfrc[body, 3:], data.xipos[body], body, row
+                )
+        return out
+
+    def linearised(self, qpos, qvel, force, scale):
+        """What comes out of every row, and its derivatives by forward differences.
+
+        qpos (n, nq), qvel (n, nv), force (n, nv) at the rows of `begin`; scale (nv,): usual forces.
+        Returns qpos (n, nq), qvel (n, nv), A (n, 2 nv, 2 nv), B (n, 2 nv, nv) in tangent coordinates.
+        """
+        n, nv, every = len(self.begin), self.model.nv, np.arange(len(self.begin))
+        q, v = self.ahead(every, qpos, qvel, force)
+        A, B = np.empty((n, 2 * nv, 2 * nv)), np.empty((n, 2 * nv, nv))
+        for d in range(nv):
+            unit = np.zeros(nv)
+            unit[d] = 1.0
+            for block, k, eps in ((A, d, SMALL[0]), (A, nv + d, SMALL[1]), (B, d, SMALL[2] * scale[d])):
+                moved = [qpos, qvel, force]
+                which = 2 if block is B else int(k >= nv)
+                moved[which] = (
+                    integrate(self.nominal, qpos, np.tile(eps * unit, (n, 1)))
+                    if which == 0
+                    else moved[which] + eps * unit
+                )
+                q1, v1 = self.ahead(every, *moved)
+                block[:, :nv, k] = difference(self.nominal, q, q1) / eps
+                block[:, nv:, k] = (v1 - v) / eps
+        return q, v, A, B
