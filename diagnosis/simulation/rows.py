@@ -23,15 +23,15 @@ SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per seco
 class RowMap:
     """Simulates every row of some recordings under a setting, with a constant extra force in each.
 
-    Effects that add coordinates of their own (backlash) or act under a condition are left out, for
-    a row's states are those of the nominal model's coordinates alone.
+    Effects that add coordinates of their own (backlash) or act under a condition are left out: a row
+    knows the nominal model's coordinates alone.
 
     begin: the rows (n,) that have a next one, counted through all recordings; seconds (n,).
     """
 
     def __init__(self, world, recordings, setting):
         self.world, self.recordings, self.nominal = world, recordings, world.model
-        setting = {c: v for c, v in setting.items() if c.effect.name != "backlash" and not c.when}
+        setting = {c: v for c, v in setting.items() if not c.when and not self._adds(c)}
         self.case = case = Case(world.model, setting, 1)
         self.working = world.engine(case.structure).working
         model = self.working.edited(case.on, case.step)
@@ -47,6 +47,12 @@ class RowMap:
         self.count = max(1, int(np.ceil(self.seconds.max() / case.step - SLACK)))
         self.control = np.concatenate([self._controls(r) for r in recordings])
         self.activation = self._activations()
+
+    def _adds(self, candidate):
+        """Whether an effect adds coordinates of its own."""
+        if not candidate.effect.overrides("build"):
+            return False
+        return self.world.engine(frozenset([candidate])).model.nv > self.nominal.nv
 
     def _controls(self, recording):
         """(rows - 1, count, nu): what the actuators see in the steps after each row."""
@@ -72,7 +78,7 @@ class RowMap:
     def ahead(self, index, qpos, qvel, force):
         """States after rows `index` (n,) of `begin` from states (n, nq), (n, nv) under force (n, nv).
 
-        Returns qpos (n, nq), qvel (n, nv), and whether something touched in the row (n,).
+        Returns qpos (n, nq), qvel (n, nv).
         """
         n, m = len(index), self.model
         out_q, out_v = np.empty((n, m.nq)), np.empty((n, m.nv))

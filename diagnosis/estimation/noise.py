@@ -1,0 +1,94 @@
+"""Measurement noise from the recordings alone: a floor for what a smoother may call noise.
+
+position, velocity = measurement_noise(model, recordings)       # (nv,), (nv,); inf where never measured
+"""
+
+import mujoco
+import numpy as np
+
+from diagnosis.estimation.windows import channels, difference, joint_slices, pooled
+
+ORDERS = range(2, 7)  # of differences: what a smooth motion leaves falls with the order, noise does not
+STRIDES = 1, 2, 4  # rows apart: noise that was filtered before it was stored shows in coarser rows
+WHITE = 0.6  # ratio of the last to the second estimate, above which noise is taken to be white
+
+
+def quantum(column):
+    """Smallest step of a reading (unit of column), if it only takes multiples of one; else 0."""
+    values = np.unique(column[np.isfinite(column)])
+    steps = np.diff(values)
+    if len(steps) < 3:
+        return 0.0
+    step = np.quantile(steps, 0.05)
+    off = abs(steps / step - np.rint(steps / step)) if step > 0 else np.ones(1)
+    return float(step) if np.mean(off < 0.05) > 0.95 and len(values) < 0.5 * len(column) else 0.0
+
+
+def difference_noise(time, column):
+    """Standard deviation of white noise in one column (T,), by divided differences on its time stamps (T,).
+
+    Weights of a divided difference annihilate a polynomial on stamps as they are; scaled to a unit
+    norm they keep the noise's size. A quantile keeps impacts and standstill out. inf where nothing moves.
+    """
+    known = np.isfinite(column)
+    time, column, best = time[known], column[known], np.inf
+    for stride in STRIDES:
+        estimates = []
+        for order in ORDERS:
+            d = _divided(time[::stride], column[::stride], order)
+            if len(d) < 5:
+                break
+            estimates.append(np.quantile(np.abs(d), 0.8) / 1.2816)
+        if not estimates:
+            break
+        best = min(estimates)
+        if len(estimates) < len(ORDERS) or estimates[-1] > WHITE * estimates[1]:
+            break
+    step = quantum(column)
+    return max(best, step / np.sqrt(12)) if best or step else np.inf
+
+
+def _divided(time, column, order):
+    """Divided differences of an order, their weights scaled to unit norm: (T - order,)."""
+    n = len(time) - order
+    if n < 1:
+        return np.zeros(0)
+    near = np.arange(n)[:, None] + np.arange(order + 1)
+    t = time[near]
+    gap = (t[:, :, None] - t[:, None]) / np.median(np.diff(time)) + np.eye(order + 1)
+    weight = 1 / gap.prod(2)
+    weight /= np.linalg.norm(weight, axis=1, keepdims=True)
+    return (weight * column[near]).sum(1)
+
+
+def measurement_noise(model, recordings):
+    """Noise of each dof's position and velocity, (nv,), (nv,); inf where nothing was measured."""
+    position, velocity = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
+    for dof in range(model.nv):
+        found = [
+            (
+                difference_noise(*_tangent_column(model, r, dof)),
+                difference_noise(r.time, r.qvel[:, dof]),
+            )
+            for r in recordings
+        ]
+        for noise, each in zip((position, velocity), np.array(found).T):
+            noise[dof] = np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else np.inf
+    for dofs in channels(model).values():  # components of one channel share their noise
+        position[dofs], velocity[dofs] = pooled(position[dofs]), pooled(velocity[dofs])
+    return position, velocity
+
+
+def _tangent_column(model, recording, dof):
+    """Time and position (n,) of one dof; of a rotation its sum of small turns."""
+    for _, kind, q, v in joint_slices(model):
+        if v.start <= dof < v.stop:
+            if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+                return recording.time, recording.qpos[:, q.start]
+            if kind == mujoco.mjtJoint.mjJNT_FREE and dof < v.start + 3:
+                return recording.time, recording.qpos[:, q.start + dof - v.start]
+            known = np.isfinite(recording.qpos[:, q.stop - 4 : q.stop]).all(1)
+            qpos, time = recording.qpos[known], recording.time[known]
+            turned = np.cumsum(difference(model, qpos[:-1], qpos[1:])[:, dof])
+            return time[1:], turned
+    raise IndexError(dof)

@@ -1,0 +1,217 @@
+"""Locate: the states of the recorded motion, and the generalized force that the simulator lacks, over time.
+
+smoother = Smoother(world, recordings)
+trajectory = smoother.locate({})              # under the nominal model; later under a corrected one
+trajectory.force, trajectory.force_sd         # (rows, nv)
+
+x' = f(x, u) + B w with w a random walk in every joint, y = x + noise; Gauss-Newton around a Kalman
+smoother over blocks of rows. Variances of w and of the noise by maximum likelihood, the noise not
+below what differences of the recordings show.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from diagnosis.effects.environment import touchable
+from diagnosis.estimation import windows as cut
+from diagnosis.estimation.kalman import smooth
+from diagnosis.estimation.noise import measurement_noise
+from diagnosis.simulation.rows import RowMap
+
+BLOCK = 200  # rows that are smoothed as one piece
+PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
+MOST = 10.0  # factor of a variance in one update
+WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Smoothed motion of recordings, rows of all of them one after the other.
+
+    qpos (rows, nq), qvel (rows, nv); force (rows, nv): what the simulator lacks, mean over the row
+    that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free (rows,):
+    where something touches, and no force is told.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    force: np.ndarray
+    qpos_sd: np.ndarray
+    qvel_sd: np.ndarray
+    force_sd: np.ndarray
+    first: dict
+    free: np.ndarray
+
+    def at(self, windows):
+        """Start states of windows: qpos (W, nq), qvel (W, nv)."""
+        rows = [self.first[w.recording] + w.first for w in windows]
+        return self.qpos[rows], self.qvel[rows]
+
+    def rows(self, recording):
+        """The slice of a recording's rows."""
+        return slice(self.first[recording], self.first[recording] + len(recording.time))
+
+
+class Smoother:
+    """Smooths recordings under any setting. position_noise, velocity_noise (nv,): standard deviations, once located."""
+
+    def __init__(self, world, recordings):
+        self.world, self.model, self.recordings = world, world.model, list(recordings)
+        model = self.model
+        lengths = [len(r.time) for r in recordings]
+        starts = np.cumsum([0] + lengths)
+        self.first = dict(zip(self.recordings, (int(a) for a in starts[:-1])))
+        states = [cut.states(model, r) for r in recordings]
+        self.qpos, self.qvel = (np.concatenate(x) for x in zip(*states))
+        measured_q = np.concatenate([r.qpos for r in recordings])
+        self.position = cut.difference(model, self.qpos, np.where(np.isfinite(measured_q), self.qpos, np.nan))
+        self.velocity = np.concatenate([r.qvel for r in recordings])
+        self._blocks(starts)
+        self.floor = self._floors(recordings)
+        self.R = self.floor.copy()
+        self.scale = self._scale()
+        self.walk = (WANDERS * self.scale) ** 2 / 0.1
+        self.position_noise, self.velocity_noise = self._noise()
+
+    def _blocks(self, starts):
+        """Cut all rows into blocks: index (rows of a block, blocks), live where a row is no padding."""
+        blocks = []
+        for a, b in zip(starts[:-1], starts[1:]):
+            edges = np.linspace(a, b, max(1, round((b - a) / BLOCK)) + 1).astype(int)
+            blocks += list(zip(edges[:-1], edges[1:]))
+        length = max(b - a for a, b in blocks)
+        self.index = np.array([np.minimum(np.arange(a, a + length), b - 1) for a, b in blocks]).T
+        self.live = np.array([np.arange(a, a + length) < b for a, b in blocks]).T
+        self.last = np.zeros(starts[-1], bool)
+        self.last[starts[1:] - 1] = True  # of a recording: nothing follows
+        self.before = np.cumsum(~self.last) - 1  # row -> its place among the rows that have a next one
+
+    def _floors(self, recordings):
+        position, velocity = measurement_noise(self.model, recordings)
+        floor = np.concatenate([position, velocity])
+        return np.where(np.isfinite(floor), np.maximum(floor, 1e-12) ** 2, 1.0)
+
+    def _noise(self):
+        nv, out = self.model.nv, np.sqrt(self.R)
+        known = np.isfinite(np.concatenate([self.position, self.velocity], 1)).any(0)
+        out = np.where(known, out, np.inf)
+        for dofs in cut.channels(self.model).values():
+            out[dofs], out[nv + dofs] = cut.pooled(out[dofs]), cut.pooled(out[nv + dofs])
+        return out[:nv], out[nv:]
+
+    def _scale(self):
+        """Usual generalized force in each dof (nv,): what holds it and what turns it round in 0.2 s."""
+        model, data = self.model, mujoco.MjData(self.model)
+        some, held = cut.evenly(len(self.qpos), 200), []
+        for row in some:
+            data.qpos[:], data.qvel[:] = self.qpos[row], self.qvel[row]
+            mujoco.mj_forward(model, data)
+            held.append(abs(data.qfrc_bias) + abs(data.qfrc_actuator))
+        speed = np.quantile(abs(self.qvel), 0.7, axis=0)
+        scale = np.mean(held, axis=0) + model.dof_M0 * (speed + 1e-3) / 0.2
+        return np.maximum(scale, 1e-3 * scale.max())
+
+    def locate(self, setting, trajectory=None, passes=PASSES):
+        """The Trajectory under a setting {Candidate: values}, begun at another one if given."""
+        rows = RowMap(self.world, self.recordings, setting)
+        if trajectory is None:
+            qpos, qvel, force = self.qpos, self.qvel, np.zeros_like(self.qvel)
+        else:
+            qpos, qvel, force = trajectory.qpos, trajectory.qvel, trajectory.force
+        for _ in range(passes):
+            free = self._touching(qpos)
+            step = self._linear(rows, qpos, qvel, force, free)
+            for _ in range(UPDATES):
+                found = self._smooth(step, qpos, qvel)
+                self._update(found)
+            found = self._smooth(step, qpos, qvel)
+            nv, live = self.model.nv, self.live
+            state, deviation = (np.empty((len(qpos), 3 * nv)) for _ in range(2))
+            state[self.index[live]], deviation[self.index[live]] = (
+                found.state[live],
+                np.sqrt(found.variance[live]),
+            )
+            qpos = cut.integrate(self.model, qpos, state[:, :nv])
+            qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
+        self.position_noise, self.velocity_noise = self._noise()
+        sd = np.split(deviation, 3, axis=1)
+        return Trajectory(qpos, qvel, force, *sd, self.first, free)
+
+    def _touching(self, qpos):
+        """Rows (N,) at or after which something touches; a force there is told by no smooth map."""
+        model = self.model
+        touch = np.zeros(len(qpos), bool)
+        if not any(touchable(model, i).any() for i in range(model.ngeom)) and not model.nflex:
+            return touch
+        data = mujoco.MjData(model)
+        for row, q in enumerate(qpos):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_collision(model, data)
+            touch[row] = data.ncon > 0
+        return touch | np.append(touch[1:], False)
+
+    def _linear(self, rows, qpos, qvel, force, free):
+        """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a trajectory; extra velocity variance."""
+        model, nv = self.model, self.model.nv
+        now = ~self.last
+        q, v, A, B = rows.linearised(qpos[now], qvel[now], force[now], self.scale)
+        n, after = len(q), np.flatnonzero(now) + 1
+        with np.errstate(invalid="ignore", over="ignore"):
+            drift = np.concatenate(
+                [cut.difference(model, qpos[after], q), v - qvel[after]], axis=1
+            ) - np.einsum("nij,nj->ni", B, force[now])
+        bad = free[now] | ~np.isfinite(drift).all(1) | ~np.isfinite(A).all((1, 2))
+        seconds = rows.seconds[bad]
+        A[bad], B[bad] = np.eye(2 * nv), 0.0
+        A[bad, :nv, nv:] = np.eye(nv) * seconds[:, None, None]
+        glide = cut.integrate(model, qpos[now][bad], qvel[now][bad] * seconds[:, None])
+        drift[bad, :nv] = cut.difference(model, qpos[after][bad], glide)
+        drift[bad, nv:] = qvel[now][bad] - qvel[after][bad]
+        extra = np.zeros((n, nv))
+        jump = np.diff(self.qvel, axis=0)[np.flatnonzero(now)]
+        extra[bad] = np.mean(jump[bad] ** 2, axis=0) if bad.any() else 0.0
+        whole = np.zeros((n, 3 * nv, 3 * nv))
+        whole[:, : 2 * nv, : 2 * nv], whole[:, : 2 * nv, 2 * nv :] = A, B
+        whole[:, 2 * nv :, 2 * nv :] = np.eye(nv)
+        return whole, np.concatenate([drift, np.zeros((n, nv))], 1), extra, rows.seconds
+
+    def _smooth(self, step, qpos, qvel):
+        A, c, extra, seconds = step
+        nv, (T, b) = self.model.nv, self.index.shape
+        follows = self.live & ~self.last[self.index]
+        follows[:-1] &= self.live[1:]
+        follows[-1] = False
+        at = np.where(follows, self.before[self.index], 0)
+        transition = np.where(follows[..., None, None], A[at], np.eye(3 * nv))
+        drift = np.where(follows[..., None], c[at], 0.0)
+        noise = np.zeros((T, b, 3 * nv))
+        noise[..., nv : 2 * nv] = extra[at]
+        noise[..., 2 * nv :] = self.walk * seconds[at][..., None]
+        noise[~follows] = 0.0
+        offset = np.concatenate([cut.difference(self.model, qpos, self.qpos), self.qvel - qvel], 1)
+        y = np.concatenate([offset[:, :nv] + self.position, self.velocity - qvel], 1)
+        y = np.where(self.live[..., None], y[self.index], np.nan)
+        first = self.index[0]
+        start = np.concatenate([offset[first], np.zeros((b, nv))], 1)
+        spread = np.concatenate(
+            [
+                (0.05 * np.std(self.qpos, axis=0).max() + 10 * np.sqrt(self.R[:nv])) ** 2,
+                np.var(self.qvel, axis=0) + 1e-6,
+                self.scale**2,
+            ]
+        )
+        return smooth(transition, drift, noise, y, self.R, start, np.tile(spread, (b, 1)))
+
+    def _update(self, found):
+        """Move every variance to where its score is nearer to zero."""
+        nv = self.model.nv
+        ratio = lambda pair: np.clip(pair[0] / np.maximum(pair[1], 1e-300), 1 / MOST, MOST)
+        self.walk = np.maximum(
+            self.walk * ratio(found.process)[2 * nv :], 1e-12 * self.scale**2
+        )
+        known = found.measurement[1] > 0
+        self.R = np.where(known, np.maximum(self.R * ratio(found.measurement), self.floor), self.R)
