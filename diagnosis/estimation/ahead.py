@@ -1,0 +1,86 @@
+"""Open-loop predictions over horizons up to a second: what the criterion compares.
+
+ahead = Ahead(world, cut_ahead(recordings), smoother)
+ahead.start(trajectory)
+residual = ahead.residual([{}, {friction: (0.1,)}])      # (settings, W, T, nv), measured less predicted
+"""
+
+import numpy as np
+
+from diagnosis.estimation import windows as cut
+
+HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
+FEWEST = 8  # windows that there should be, if shorter ones make up for it
+MOST = 48  # windows that are simulated, evenly chosen of more
+GROUPS = 12  # of neighbouring windows, the units that are left out and compared
+
+
+def cut_ahead(recordings, longest=HORIZONS[-1]):
+    """Windows end to end, as long as the longest horizon, or shorter where that gave fewer than FEWEST."""
+    seconds = [r.time[-1] - r.time[r.start] for r in recordings]
+    sample = cut.sampling(recordings)
+    longest = max(min(longest, sum(seconds) / FEWEST), 12 * sample)
+    windows = [w for r in recordings for w in cut.consecutive(r, longest, r.start)]
+    return [windows[i] for i in cut.evenly(len(windows), MOST)]
+
+
+class Ahead:
+    """Windows of recordings with start states, and what is measured in them.
+
+    measured (W, T, nq), known (W, T, nv); band (W, T): index of the horizon that a row's time ahead
+    falls into, -1 for none; group (W,): which windows are left out together; channels: [dofs];
+    travel (nv,): recorded range, beyond which a prediction is lost.
+    """
+
+    def __init__(self, world, windows, noise):
+        self.world, self.model, self.windows = world, world.model, windows
+        self.measured = cut.measured(windows)
+        self.known = np.isfinite(cut.difference(self.model, self.measured, self.measured))
+        self.known[:, 0] = False
+        count = self.measured.shape[1]
+        ahead = np.full((len(windows), count), np.nan)
+        for row, w in zip(ahead, windows):
+            row[: w.last - w.first + 1] = w.recording.time[w.first : w.last + 1]
+        self.seconds = ahead - ahead[:, :1]
+        ends = np.nanmax(self.seconds) * np.array(HORIZONS) / HORIZONS[-1] * (1 + 1e-6)
+        self.band = np.where(np.isnan(self.seconds), -1, np.searchsorted(ends, self.seconds))
+        self.band[:, 0] = -1
+        self.band[self.band >= len(ends)] = -1
+        number = min(GROUPS, len(windows))
+        self.group = np.arange(len(windows)) * number // len(windows)
+        self.channels = list(cut.channels(self.model).values())
+        self.noise = noise
+        self.travel = self._travel()
+        self.qpos, self.qvel = cut.recorded_starts(self.model, windows)
+
+    @property
+    def steps(self):
+        """Simulated steps of one prediction of all windows."""
+        return np.nansum(self.seconds.max(1, where=np.isfinite(self.seconds), initial=0.0)) / (
+            self.model.opt.timestep
+        )
+
+    def _travel(self):
+        start = self.measured[:, :1]
+        gone = np.abs(cut.difference(self.model, np.broadcast_to(start, self.measured.shape), self.measured))
+        gone = np.where(np.isfinite(gone), gone, 0.0).reshape(-1, self.model.nv)
+        return np.maximum(np.quantile(gone, 0.98, axis=0), 10 * np.where(np.isfinite(self.noise), self.noise, 1.0))
+
+    def start(self, trajectory):
+        """Begin the windows at a Trajectory's states."""
+        self.qpos, self.qvel = trajectory.at(self.windows)
+
+    def residual(self, settings):
+        """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther than the travel."""
+        n, W = len(settings), len(self.windows)
+        each = [s for s in settings for _ in range(W)]
+        qpos = self.world.simulate(
+            each, np.tile(self.qpos, (n, 1)), np.tile(self.qvel, (n, 1)), self.windows * n
+        )[0]
+        out = np.empty((n, *self.known.shape))
+        for k in range(n):
+            with np.errstate(invalid="ignore", over="ignore"):
+                gap = cut.difference(self.model, qpos[k * W : (k + 1) * W], self.measured)
+            gap = np.where(np.isfinite(gap), np.clip(gap, -self.travel, self.travel), self.travel)
+            out[k] = np.where(self.known, gap, 0.0)
+        return out

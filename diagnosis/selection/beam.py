@@ -1,0 +1,86 @@
+"""A beam over sets of effects on one matrix of sums: the sets worth a refit in the simulator.
+
+for setting in Beam(columns, evidence).sets(): ...
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnosis.selection.criterion import Score
+from diagnosis.selection.judge import moved_setting, problem
+
+WIDTH, LOOKS = 5, 10  # sets that are carried on, and further effects tried in each in full
+DEPTH = 4  # effects added in one round
+LEAST = 0.01  # loss that an effect must remove in the first look
+
+
+@dataclass(frozen=True)
+class Node:
+    """A set of options beside those of the effects that are in the model already."""
+
+    options: tuple
+    score: Score
+    loss: float
+
+
+class Beam:
+    """Looks for sets of options that lower the loss, priors and plausibility included."""
+
+    def __init__(self, columns, evidence):
+        self.columns, self.evidence = columns, evidence
+        inside = columns.setting
+        self.kept = tuple(k for k, o in enumerate(columns.options) if o.candidate in inside)
+        self.free = [k for k, o in enumerate(columns.options) if o.candidate not in inside]
+
+    def node(self, options):
+        """The Node of some options (those kept included)."""
+        given = problem(self.columns, options)
+        score = self.evidence.score(*given)
+        setting = moved_setting(self.columns, score.amounts, options)
+        cost, penalty = 0.0, {o.candidate: o.prior for o in map(self.columns.options.__getitem__, options)}
+        for candidate, prior in penalty.items():
+            cost += prior.cost(setting[candidate])
+        return Node(tuple(options), score, score.loss + cost / self.evidence.number)
+
+    def nodes(self):
+        """All nodes met, best first; the first one met is the model as it is."""
+        start = self.node(self.kept)
+        met, beam = {start.options: start}, [start]
+        for _ in range(DEPTH):
+            grown = []
+            for node in beam:
+                for k in self._looks(node):
+                    options = (*node.options, k)
+                    key = tuple(sorted(options))
+                    if key in met:
+                        continue
+                    met[key] = new = self.node(options)
+                    if new.loss < node.loss - LEAST:
+                        grown.append(new)
+            if not grown:
+                break
+            beam = sorted(grown, key=lambda n: n.loss)[:WIDTH]
+        return start, sorted(met.values(), key=lambda n: n.loss)
+
+    def _looks(self, node):
+        """Indices of the further options with most gain in a first look."""
+        index, *_, precision, _ = problem(self.columns, node.options)
+        gain = self.evidence.looks(index, node.score.amounts, precision)
+        taken = {self.columns.options[k].candidate for k in node.options}
+        each = {
+            k: gain[list(self.columns.options[k].columns)].sum()
+            for k in self.free
+            if self.columns.options[k].candidate not in taken
+        }
+        best, seen = [], {}
+        for k in sorted(each, key=lambda k: -each[k]):
+            candidate = self.columns.options[k].candidate
+            seen[candidate] = seen.get(candidate, 0) + 1
+            if seen[candidate] <= 2:  # starts of one candidate
+                best.append(k)
+        return best[:LOOKS]
+
+    def setting(self, node):
+        """The setting {Candidate: values} of a node."""
+        return moved_setting(self.columns, node.score.amounts, node.options)

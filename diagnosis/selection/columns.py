@@ -1,0 +1,178 @@
+"""Every effect as columns: how the open-loop predictions change with its values.
+
+columns = Columns(ahead, setting, usual)
+columns.options[3].candidate; columns.values(3, amounts)
+
+An option is a candidate begun at some values: one column for each parameter where it acts in
+proportion, one for a whole start of values where it does not (a dead zone, a delay of many rows).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnosis.selection.plausibility import plausible
+
+TOGETHER = 12  # settings that are simulated in one call
+FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column stands for it
+PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
+SECANTS = 24  # candidates that are simulated once more at the values that suit them best
+
+
+@dataclass(frozen=True)
+class Option:
+    """A candidate at a start.
+
+    base (k,): its values in the setting; directions (p, k): change of the values per unit of each of
+    its p columns; columns (p,): their indices; low, high (p,): bounds of the amounts; prior: a Prior.
+    """
+
+    candidate: object
+    base: np.ndarray
+    directions: np.ndarray
+    columns: tuple
+    low: np.ndarray
+    high: np.ndarray
+    prior: object
+    merges: bool = False
+
+    def values(self, amounts):
+        """The candidate's values at amounts (p,)."""
+        if self.merges:
+            rows, at = self.base + self.directions, list(amounts)
+            start, amount = self.candidate.effect.merged(rows, at)
+            values = np.array(start, float)
+            values[0] = self.base[0] + amount * (start[0] - self.base[0])
+        else:
+            values = self.base + np.asarray(amounts) @ self.directions
+        return tuple(np.clip(values, self.prior.low, self.prior.high))
+
+    def quadratic(self):
+        """(precision, pull) (p,) of the prior about the base, for the criterion."""
+        k = np.array(self.prior.precision(self.base))
+        precision = (self.directions**2 * k).sum(1)
+        pull = -(self.directions * k * (self.base - self.prior.centre)).sum(1)
+        return precision, pull
+
+
+class Columns:
+    """Simulates the columns of candidates about a setting. residual (W, T, nv); array (W, T, nv, K); options."""
+
+    def __init__(self, ahead, setting, usual, candidates):
+        self.ahead, self.setting, self.usual, self.world = ahead, setting, usual, ahead.world
+        self.settings, self.options, self.simulated = [{}], [], 0
+        self.residual = ahead.residual([setting])[0]
+        self.lost = (abs(self.residual) >= ahead.travel).any(1)  # (W, nv): told by no slope
+        self.parts, starts = [], []
+        for candidate in candidates:
+            starts += self._starts(candidate)
+        self._simulate(starts)
+
+    @property
+    def array(self):
+        """(W, T, nv, K)."""
+        return np.stack(self.parts, -1) if self.parts else np.zeros((*self.residual.shape, 0))
+
+    def _starts(self, candidate):
+        """[(candidate, base, directions, low, high, prior, merges)] of a candidate's options."""
+        world, recordings = self.world, self.usual.recordings
+        prior = plausible(candidate, self.usual)
+        inside = candidate in self.setting
+        base = np.array(self.setting.get(candidate, candidate.nominal), float)
+        if inside or not candidate.effect.overrides("probes"):
+            one = self._proportional(candidate, base, prior)
+            out = [one] if one else []
+            if inside:
+                return out
+            whole = list(world.far(candidate, recordings))
+        else:
+            out, whole = [], list(world.probes(candidate, recordings))
+        together = candidate.effect.together
+        if together == 1:
+            whole = [whole[i] for i in np.unique(np.linspace(0, len(whole) - 1, min(len(whole), PROBES)).astype(int))] if whole else []
+        for k in range(0, len(whole), together):
+            rows = np.array(whole[k : k + together], float)
+            start = np.where(np.isfinite(base), base, 0.0)
+            finite = np.isfinite(base).all()
+            directions = rows - start if finite else rows
+            amounts = FULL if together == 1 else (-FULL[1], FULL[1])
+            if not finite:
+                amounts = (1.0, 1.0)  # a limit that there was not: no share of it means anything
+                start = np.zeros_like(start)
+            low, high = (np.full(len(rows), a) for a in amounts)
+            if all(prior.inside(row) for row in rows):
+                out.append((candidate, start, directions, low, high, prior, together > 1))
+        return out
+
+    @staticmethod
+    def _proportional(candidate, base, prior):
+        steps = np.array([p.step for p in candidate.parameters])
+        steps = np.where((base + steps > prior.high) | ~np.isfinite(steps), -abs(steps), steps)
+        fits = (base + steps >= prior.low) & np.isfinite(base)
+        if not fits.any():
+            return None
+        directions = np.diag(steps)[fits]
+        ends = np.stack([(prior.low - base) / steps, (prior.high - base) / steps])
+        low, high = ends.min(0)[fits], ends.max(0)[fits]
+        return candidate, base, directions, low, high, prior, False
+
+    def _simulate(self, starts):
+        """Simulate starts; those that change nothing are left out."""
+        jobs = [(s, row) for s, start in enumerate(starts) for row in start[2]]
+        changes = []
+        for k in range(0, len(jobs), TOGETHER):
+            some = jobs[k : k + TOGETHER]
+            settings = [
+                {**self.setting, starts[s][0]: tuple(starts[s][1] + row)} for s, row in some
+            ]
+            found = self.ahead.residual(settings)
+            self.simulated += len(settings)
+            for gap in found:
+                change = self.residual - gap
+                far = (abs(gap) >= self.ahead.travel).any(1) | self.lost
+                change[np.broadcast_to(far[:, None], change.shape)] = 0.0
+                changes.append(change.astype(np.float32))
+        at = 0
+        for start in starts:
+            own = changes[at : at + len(start[2])]
+            at += len(own)
+            seen = np.array([self._seen(c) for c in own])
+            if not seen.any() or (start[6] and not seen.all()):
+                continue
+            columns = tuple(range(len(self.parts), len(self.parts) + seen.sum()))
+            self.parts += [c for c, yes in zip(own, seen) if yes]
+            candidate, base, directions, low, high, prior, merges = start
+            self.options.append(
+                Option(candidate, base, directions[seen], columns, low[seen], high[seen], prior, merges)
+            )
+
+    def _seen(self, change):
+        """Whether a column says anything: more than rounding, beside the noise."""
+        noise = np.where(np.isfinite(self.ahead.noise), self.ahead.noise, np.inf)
+        return bool((np.sqrt(np.mean(change**2, axis=(0, 1))) > 1e-6 * noise).any())
+
+    def secants(self, evidence):
+        """Options of single parameters again, with a column at the value that suits each best alone.
+
+        A small step of what sticks, saturates or is late by less than a row says little of a large one.
+        """
+        ranked = []
+        for k, option in enumerate(self.options):
+            if len(option.columns) > 1 or option.merges or option.candidate in self.setting:
+                continue
+            precision, pull = option.quadratic()
+            score = evidence.score(option.columns, option.low, option.high, precision, pull)
+            if abs(score.amounts[0]) > 1e-9:
+                ranked.append((score.loss, k, score.amounts))
+        starts = []
+        for _, k, amounts in sorted(ranked, key=lambda x: x[:2])[:SECANTS]:
+            o = self.options[k]
+            row = np.array(o.values(amounts)) - o.base
+            if not row.any():
+                continue
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ends = np.stack([o.prior.low - o.base, o.prior.high - o.base]) / row
+            ends = ends[:, np.isfinite(ends).all(0) & (row != 0)]
+            low, high = max(ends.min(0).max(initial=-9), -0.5), min(ends.max(0).min(initial=9), 4.0)
+            starts.append((o.candidate, o.base, row[None], np.array([low]), np.array([high]), o.prior, False))
+        self._simulate(starts)

@@ -1,0 +1,176 @@
+"""The one criterion: log prediction error over horizons, on groups of windows that the values were not fitted to.
+
+evidence = Evidence(ahead, residual, columns)          # residual (W, T, nv), columns (W, T, nv, K)
+score = evidence.score([0, 3], low, high, precision, pull)
+score.loss, score.groups, score.amounts
+gain = paired(score, other)
+
+A hypothesis predicts residual - columns @ amounts. Its error counts per cell: a channel (a joint, a free
+joint's position or rotation) in a band of time ahead, in a group of windows. The loss is the sum over
+channels of the mean over bands and groups of log RMS, each group predicted with the others' amounts.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+SHARE = 0.1  # of a cell's median error over groups, that counts as none: one still window decides nothing
+NOISE = 0.3  # of the noise, that counts as none
+GROSS = 5.0  # a window's error over the median, from which on it counts no more
+ITERATIONS = 3  # of reweighted least squares
+
+
+@dataclass(frozen=True)
+class Score:
+    """loss: sum over channels of mean log RMS; groups (G,): the same of each group; amounts (p,): fitted to all."""
+
+    loss: float
+    groups: np.ndarray
+    amounts: np.ndarray
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """gain: loss removed, in nats of log RMS; spread: its standard error over groups; p_value: one-sided, that it is none."""
+
+    gain: float
+    spread: float
+    p_value: float
+
+
+def paired(before, after):
+    """Comparison of two Scores, differences paired by group."""
+    d = before.groups - after.groups
+    n = len(d)
+    spread = float(np.std(d, ddof=1) / np.sqrt(n)) if n > 1 else np.inf
+    gain = float(before.loss - after.loss)
+    t = d.mean() / spread if spread > 0 else np.sign(d.mean()) * np.inf
+    return Comparison(gain, spread, float(stats.t.sf(t, max(n - 1, 1))) if d.any() else 1.0)
+
+
+class Evidence:
+    """Sums of products of the residual (first) and columns per group and cell: everything a hypothesis needs."""
+
+    def __init__(self, ahead, residual, columns, reference=None):
+        """reference (G, cells): floors of the squared error; None makes them of this residual."""
+        groups, bands = ahead.group.max() + 1, range(ahead.band.max() + 1)
+        stack = np.concatenate([residual[..., None], columns], -1)
+        cells = [(dofs, b) for dofs in ahead.channels for b in bands]
+        K = stack.shape[-1]
+        self.gram = np.zeros((groups, len(cells), K, K))
+        self.count = np.zeros((groups, len(cells)))
+        self.channels = len(ahead.channels)
+        self.cells = np.zeros(len(cells), bool)
+        least = np.zeros(len(cells))
+        for j, (dofs, b) in enumerate(cells):
+            inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
+            noise = np.where(np.isfinite(ahead.noise[dofs]), ahead.noise[dofs], 0.0)
+            least[j] = (NOISE**2) * np.mean(noise**2)
+            weight = _weights(residual[..., dofs], inside)
+            for g in range(groups):
+                w = np.flatnonzero((ahead.group == g) & inside.any((1, 2)))
+                if not len(w):
+                    continue
+                part, here = stack[w][:, :, dofs], inside[w]
+                rows = part[here] * np.repeat(np.sqrt(weight[w]), here.sum((1, 2)))[:, None]
+                self.gram[g, j], self.count[g, j] = rows.T @ rows, len(rows)
+        self.cells = (self.count > 0).any(0)
+        square = self.gram[:, :, 0, 0] / np.maximum(self.count, 1)
+        self.floor = reference
+        if reference is None:
+            middle = [np.median(s[c > 0]) if (c > 0).any() else 0.0 for s, c in zip(square.T, self.count.T)]
+            self.floor = np.tile(least + SHARE**2 * np.array(middle) + 1e-30, (groups, 1))
+        self.number = max(self.cells.sum() * groups / max(self.channels, 1), 1)  # cells per channel
+
+    def _square(self, index, amounts):
+        """Mean squared error (G, cells) of amounts (p,) or (G, p) of columns `index`."""
+        z = np.concatenate([np.ones((*amounts.shape[:-1], 1)), -amounts], -1)
+        g = self.gram[:, :, index][..., index]
+        z = np.broadcast_to(z, (len(g), z.shape[-1]))
+        return np.maximum(np.einsum("gi,gcij,gj->gc", z, g, z, optimize=True), 0.0) / np.maximum(
+            self.count, 1
+        )
+
+    def losses(self, square):
+        """Loss of every group (G,) from mean squared errors (G, cells)."""
+        log = np.where(self.count > 0, 0.5 * np.log(square + self.floor), 0.0)
+        return log.sum(1) / np.maximum((self.count > 0).sum(1), 1) * self.channels
+
+    def score(self, columns, low, high, precision, pull):
+        """Score of a hypothesis.
+
+        columns: indices (p,); low, high (p,): bounds of the amounts; precision, pull (p,): of a
+        quadratic prior, precision/2 amount² - pull amount, in nats.
+        """
+        index = np.concatenate([[0], np.asarray(columns, int) + 1])
+        p, amounts = len(index) - 1, np.zeros(len(index) - 1)
+        if not p:
+            groups = self.losses(self._square(index, amounts))
+            return Score(float(groups.mean()), groups, amounts)
+        g = self.gram[:, :, index][..., index]
+        for _ in range(ITERATIONS):
+            weight = self._weight(index, amounts)
+            each = np.einsum("gc,gcij->gij", weight, g)
+            whole = each.sum(0)
+            amounts = bounded(
+                whole[1:, 1:] + np.diag(precision), whole[1:, 0] + pull, low, high
+            )
+        weight = self._weight(index, amounts)
+        each = np.einsum("gc,gcij->gij", weight, g)
+        rest = each.sum(0) - each
+        left = np.array(
+            [
+                bounded(r[1:, 1:] + np.diag(precision), r[1:, 0] + pull, low, high)
+                for r in rest
+            ]
+        )
+        groups = self.losses(self._square(index, left))
+        return Score(float(groups.mean()), groups, amounts)
+
+    def _weight(self, index, amounts):
+        """(G, cells): weights of squares at which least squares lowers the sum of logs."""
+        square = self._square(index, amounts)
+        return np.where(self.count > 0, 1 / (np.maximum(self.count, 1) * (square + self.floor)), 0.0)
+
+    def looks(self, columns, amounts, precision):
+        """In-sample gain (K,) in nats of each further column beside some at their amounts: a first look."""
+        index = np.concatenate([[0], np.asarray(columns, int) + 1])
+        weight = self._weight(index, np.asarray(amounts, float))
+        whole = np.einsum("gc,gcij->ij", weight, self.gram, optimize=True)
+        inside = whole[np.ix_(index[1:], index[1:])] + np.diag(precision)
+        score = whole[1:, 0] - whole[1:, index[1:]] @ amounts
+        curve = np.diag(whole)[1:].copy()
+        if len(index) > 1:
+            cross = whole[1:, index[1:]]
+            curve -= (cross * np.linalg.solve(inside, cross.T).T).sum(1)
+        seen = curve > 1e-9 * np.maximum(np.diag(whole)[1:], 1e-300)
+        return np.where(seen, score**2 / np.where(seen, curve, 1.0) / 2, 0.0)
+
+
+def _weights(residual, inside):
+    """(W,): less than one for windows whose error is gross beside the others'."""
+    square = np.where(inside, residual**2, 0.0).sum((1, 2)) / np.maximum(inside.sum((1, 2)), 1)
+    some = square[inside.any((1, 2))]
+    usual = np.median(some) if len(some) else 0.0
+    return np.minimum(1.0, GROSS**2 * usual / np.maximum(square, 1e-300)) if usual else np.ones(len(square))
+
+
+def bounded(matrix, vector, low, high):
+    """The minimum of x' matrix x / 2 - vector x between bounds, by fixing what goes beyond them."""
+    p, fixed = len(vector), np.zeros(len(vector), bool)
+    x = np.zeros(p)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    for _ in range(p + 1):
+        free = ~fixed
+        if free.any():
+            s = scale[free]
+            a = matrix[np.ix_(free, free)] / np.outer(s, s) + 1e-9 * np.eye(free.sum())
+            b = (vector[free] - matrix[np.ix_(free, fixed)] @ x[fixed]) / s
+            x[free] = np.linalg.solve(a, b) / s
+        beyond = free & ((x < low) | (x > high))
+        if not beyond.any():
+            break
+        x = np.clip(x, low, high)
+        fixed |= beyond
+    return x

@@ -1,0 +1,172 @@
+"""Rounds of locating, naming and judging, until no further effect earns its place.
+
+found = Identification(world, train).run()
+found.fitted.setting; found.trajectory; found.rivals
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.selection.beam import Beam
+from diagnosis.selection.columns import Columns
+from diagnosis.selection.criterion import Evidence, paired
+from diagnosis.selection.judge import Fitted, Judge
+from diagnosis.selection.plausibility import Usual
+
+ROUNDS = 4
+EARNS = 0.05  # nats of log RMS error, summed over channels, that an effect has to remove
+LEVEL = 0.05  # of false additions in all that is looked at
+FINALISTS = 6  # sets that the simulator judges in a round
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the search ended with: fitted, the Fitted set; bare, the same of the nominal model on the same windows
+    and start states; trajectory and first, smoothed under it and under the nominal model."""
+
+    fitted: Fitted
+    bare: Fitted
+    trajectory: object
+    first: object
+    smoother: Smoother
+    ahead: Ahead
+    usual: Usual
+    judge: Judge
+    ranking: list
+
+
+class Identification:
+    """The search. say(done, message): progress; log(message): what was decided."""
+
+    def __init__(self, world, train, say=None, log=None):
+        self.world, self.train = world, train
+        self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
+        self.candidates = [
+            c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
+        ]
+
+    def run(self):
+        """The Found of all rounds."""
+        self.say(0.0, "locating the missing force")
+        smoother = Smoother(self.world, self.train)
+        first = trajectory = smoother.locate({})
+        self.usual = Usual(self.world, self.train, smoother.scale)
+        self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
+        setting, ranking = {}, []
+        for i in range(ROUNDS):
+            self.ahead.start(trajectory)
+            self.say(0.1 + 0.2 * i, f"searching {len(self.candidates)} candidates")
+            fitted, better, look = self._round(setting)
+            ranking = ranking or look
+            if not better:
+                break
+            setting = fitted.setting
+            trajectory = smoother.locate(setting, trajectory, passes=1)
+        self.ahead.start(trajectory)
+        judge = Judge(self.ahead, self.usual)
+        fitted = judge.fit(setting)
+        bare = judge.fit({})
+        return Found(
+            fitted, bare, trajectory, first, smoother, self.ahead, self.usual, judge, ranking
+        )
+
+    def _round(self, setting):
+        """(Fitted, whether it is better than what there was, first ranking)."""
+        columns = Columns(self.ahead, setting, self.usual, self.candidates)
+        evidence = Evidence(self.ahead, columns.residual, columns.array)
+        columns.secants(evidence)
+        evidence = Evidence(self.ahead, columns.residual, columns.array, evidence.floor)
+        beam = Beam(columns, evidence)
+        start, nodes = beam.nodes()
+        self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}")
+        judge = Judge(self.ahead, self.usual, evidence.floor)
+        now = judge.fit(setting)
+        judged = [now]
+        for node in self._finalists(beam, start, nodes):
+            fitted = judge.fit(beam.setting(node))
+            self.log(f"  linear {node.loss:.3f} judged {fitted.loss:.3f} {said(fitted.setting)}")
+            judged.append(fitted)
+        best = self._choose(judged, now, len(nodes))
+        if best is not now:
+            best = self._pruned(judge, best)
+            self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
+        return best, best is not now, [] if setting else self._ranking(beam, start)
+
+    def _finalists(self, beam, start, nodes):
+        """Nodes for the simulator: the best, and the best of each first effect and each size."""
+        chosen, seen = [], set()
+        for node in nodes:
+            if node.loss > start.loss - EARNS / 2:
+                break
+            names = frozenset(
+                beam.columns.options[k].candidate for k in node.options[len(start.options) :]
+            )
+            if names in seen:
+                continue
+            size = sum(len(n) == len(names) for n in seen)
+            if size < 2 or len(chosen) < 2:
+                seen.add(names)
+                chosen.append(node)
+            if len(chosen) >= FINALISTS:
+                break
+        return chosen
+
+    def _choose(self, judged, now, number):
+        """The simplest set that is as good as the best, if that earns its place over what there was."""
+        best = min(judged, key=lambda f: f.loss)
+        if best is now or not self.earned(now, best, number):
+            return now
+        near = [
+            f
+            for f in judged
+            if f is not now and (f.loss < best.loss + EARNS or paired(f.score, best.score).gain < paired(f.score, best.score).spread)
+        ]
+        return min(near, key=lambda f: (complexity(f.setting), f.loss))
+
+    def earned(self, before, after, number=1):
+        """Whether a set removes enough of the loss, and by more than groups scatter, for the number looked at."""
+        step = paired(before.score, after.score)
+        return step.gain >= EARNS and step.p_value < LEVEL / max(number, 1) ** 0.5
+
+    def _pruned(self, judge, fitted):
+        """Without the effects that do not earn their place beside the others."""
+        while len(fitted.setting) > 1:
+            tries = [
+                judge.fit({c: v for c, v in fitted.setting.items() if c is not out}, steps=3)
+                for out in fitted.setting
+            ]
+            less = min(tries, key=lambda f: f.loss)
+            if self.earned(less, fitted):
+                break
+            fitted = less
+        return fitted
+
+    @staticmethod
+    def _ranking(beam, start):
+        """[(candidate, share of log error removed alone)]."""
+        best = {}
+        for k in beam.free:
+            node = beam.node((*beam.kept, k))
+            c = beam.columns.options[k].candidate
+            best[c] = max(best.get(c, 0.0), start.loss - node.loss)
+        return sorted(best.items(), key=lambda item: -item[1])
+
+
+def complexity(setting):
+    """Parameters of a set, and how far its effects are from the first things to think of."""
+    return sum(
+        sum(v != n for v, n in zip(values, c.nominal)) + 0.5 * c.effect.simplicity
+        for c, values in setting.items()
+    )
+
+
+def said(setting):
+    """A set in one line."""
+    return ", ".join(
+        f"{c.effect.name} {c.place.name} " + " ".join(f"{x:.4g}" for x in v)
+        for c, v in setting.items()
+    )

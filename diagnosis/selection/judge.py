@@ -1,0 +1,115 @@
+"""The simulator as judge: sets of effects refitted in it, compared by the one criterion.
+
+judge = Judge(ahead, usual)
+fitted = judge.fit({friction: (0.1,)})
+fitted.values, fitted.score.loss
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from diagnosis.selection.columns import Columns
+from diagnosis.selection.criterion import Evidence, Score
+from diagnosis.selection.plausibility import plausible, possible
+
+STEPS = 6  # Gauss-Newton steps of a refit, at most
+DONE = 2e-3  # loss that another step would still remove, from which on a refit is done
+HALVINGS = 3  # of a step that does not lower the loss
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A set of effects refitted. setting: {Candidate: values}; score: of the groups left out, priors included;
+    columns, evidence: at these values."""
+
+    setting: dict
+    score: Score
+    columns: Columns = field(repr=False)
+    evidence: Evidence = field(repr=False)
+
+    @property
+    def loss(self):
+        return self.score.loss
+
+
+class Judge:
+    """Refits settings in the simulator on the windows of an Ahead; reference: floors of the cells to compare by."""
+
+    def __init__(self, ahead, usual, reference=None):
+        self.ahead, self.usual, self.reference = ahead, usual, reference
+        self.simulated = 0
+
+    def fit(self, setting, steps=STEPS):
+        """The Fitted values of a set of effects, begun at the values given."""
+        setting = {c: self._inside(c, v) for c, v in setting.items()}
+        for left in range(steps, -1, -1):
+            columns = Columns(self.ahead, setting, self.usual, list(setting))
+            self.simulated += columns.simulated + 1
+            evidence = Evidence(self.ahead, columns.residual, columns.array, self.reference)
+            index, low, high, precision, pull = problem(columns, range(len(columns.options)))
+            score = evidence.score(index, low, high, precision, pull)
+            here = evidence.score((), *[np.zeros(0)] * 4)
+            better = self._lower(columns, evidence, score.amounts, setting) if left else None
+            if better is None:
+                break
+            setting = better
+        prior = self.cost(setting) / evidence.number
+        # values of left-out groups deviate by no more than those fitted without them
+        final = Score(score.loss + prior, score.groups + prior, score.amounts)
+        if not len(index):
+            final = Score(here.loss + prior, here.groups + prior, here.amounts)
+        return Fitted(setting, final, columns, evidence)
+
+    def _lower(self, columns, evidence, amounts, setting):
+        """The setting after a step that lowers the loss by more than DONE, or None."""
+        inside = self._whole(columns.residual, setting, evidence)
+        share = 1.0
+        for _ in range(HALVINGS):
+            moved = moved_setting(columns, share * amounts)
+            if all(possible(c, v, plausible(c, self.usual)) for c, v in moved.items()):
+                residual = self.ahead.residual([moved])[0]
+                self.simulated += 1
+                if self._whole(residual, moved, evidence) < inside - DONE:
+                    return moved
+            share /= 3
+        return None
+
+    def _whole(self, residual, setting, evidence):
+        """Loss of a residual with nothing left out, priors included."""
+        plain = Evidence(self.ahead, residual, np.zeros((*residual.shape, 0)), evidence.floor)
+        return plain.score((), *[np.zeros(0)] * 4).loss + self.cost(setting) / evidence.number
+
+    def cost(self, setting):
+        """Minus the log prior density of a setting's values, nats."""
+        return sum(plausible(c, self.usual).cost(v) for c, v in setting.items())
+
+    def _inside(self, candidate, values):
+        prior = plausible(candidate, self.usual)
+        return tuple(float(x) for x in np.clip(values, prior.low, prior.high))
+
+
+def problem(columns, chosen):
+    """(indices, low, high, precision, pull) of options, for Evidence.score."""
+    options = [columns.options[k] for k in chosen]
+    if not options:
+        return (), *[np.zeros(0)] * 4
+    quadratic = [o.quadratic() for o in options]
+    return (
+        [i for o in options for i in o.columns],
+        np.concatenate([o.low for o in options]),
+        np.concatenate([o.high for o in options]),
+        np.concatenate([p for p, _ in quadratic]),
+        np.concatenate([p for _, p in quadratic]),
+    )
+
+
+def moved_setting(columns, amounts, chosen=None):
+    """The setting after the amounts of some options (all of them by default), one option after the other."""
+    moved, at = dict(columns.setting), 0
+    for k in range(len(columns.options)) if chosen is None else chosen:
+        option = columns.options[k]
+        part = amounts[at : at + len(option.columns)]
+        at += len(option.columns)
+        moved[option.candidate] = tuple(float(x) for x in option.values(part))
+    return moved

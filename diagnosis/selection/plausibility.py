@@ -1,0 +1,169 @@
+"""How plausible values are: weak, proper priors in units of the machine, in one table.
+
+usual = Usual(world, recordings, force)            # what the machine does
+prior = plausible(candidate, usual)                # centre, scale, low, high of each parameter
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnosis.effects.actuators import ActuatorEffect
+from diagnosis.effects.bodies import _size
+from diagnosis.estimation import windows as cut
+
+TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
+
+# of each effect: (unit, scale, low, high) in that unit, one row for all its parameters or one for each.
+#   times: ratio to the nominal value      force: share of the joint's usual force
+#   inertia: share of what the joint moves  size: of the body        plain: in the parameter's own unit
+#   used: share of the largest force asked for     gone: share of the recorded travel
+TABLE = {
+    "mass": [("times", 0.4, 0.3, 3.0)],
+    "payload_change": [("times", 0.4, 0.3, 3.0)],
+    "center_of_mass": [("size", 0.3, -1.5, 1.5)],
+    "inertia": [("times", 0.4, 0.25, 4.0)],
+    "armature": [("inertia", 0.5, 0.0, 20.0)],
+    "viscous_damping": [("per speed", 0.7, 0.0, 5.0)],
+    "quadratic_damping": [("per speed²", 0.5, 0.0, 5.0)],
+    "back_emf": [("per speed", 0.7, 0.0, 5.0)],
+    "coulomb_friction": [("force", 0.7, 0.0, 3.0)],
+    "stribeck_friction": [
+        ("force", 0.7, 0.0, 3.0),
+        ("force", 0.7, 0.0, 3.0),
+        ("plain", np.inf, 1e-4, np.inf),
+    ],
+    "stiffness": [("per travel", 0.5, 0.0, 5.0)],
+    "nonlinear_stiffness": [("per travel³", 0.5, -5.0, 5.0)],
+    "spring_offset": [("force", 0.5, -2.0, 2.0)],
+    "cogging": [("force", 0.2, -1.0, 1.0), ("plain", np.inf, 0.1, np.inf), ("plain", np.inf, -10, 10)],
+    "backlash": [("travel", 0.05, 0.0, 0.3)],
+    "gain": [("times", 0.25, 0.5, 2.0)],
+    "bias": [("strength", 0.3, -1.5, 1.5)],
+    "saturation": [("used", np.inf, 0.3, np.inf)],
+    "delay": [("plain", 0.03, 0.0, 0.15)],
+    "lag": [("plain", 0.03, 0.0, 0.3)],
+    "dead_zone": [("used", 0.15, 0.0, 0.5)],
+    "gravity": [("plain", 1.0, -12.0, 12.0)],
+    "wind": [("plain", 3.0, -30.0, 30.0)],
+    "air_drag": [("plain", np.inf, 0.0, 3000.0)],
+    "contact_friction": [("times", 0.5, 0.15, 5.0)],
+    "contact_stiffness": [("times", 3.0, 0.02, 50.0)],
+    "contact_damping": [("times", 3.0, 0.02, 50.0)],
+    "ground_height": [("plain", 0.02, -0.1, 0.1)],
+    "sensor_bias": [("plain", 0.05, -0.5, 0.5)],
+    "sensor_scale": [("times", 0.05, 0.8, 1.25)],
+    "sensor_delay": [("plain", 0.02, 0.0, 0.1)],
+    "external_force": [("weight", 0.3, -1.0, 1.0)],
+    "link_length": [("times", 0.1, 0.7, 1.4)],
+    "load_friction": [("plain", 0.3, 0.0, 0.9)],
+}
+AWAY = "gravity", "ground_height", "bias", "spring_offset", "center_of_mass", "external_force", "wind"
+STRENGTH = 0.04  # share by which gravity's strength may differ from the model's
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Of one candidate's parameters (k,): nominal centre and scale of a Student's t; low and high bounds."""
+
+    centre: np.ndarray
+    scale: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def cost(self, values):
+        """Minus the log density, but for a constant: nats."""
+        z = (np.asarray(values) - self.centre) / self.scale
+        return float(0.5 * (TAIL + 1) * np.log1p(z**2 / TAIL).sum())
+
+    def precision(self, values):
+        """Curvature of the cost for iterated least squares, (k,)."""
+        z = (np.asarray(values) - self.centre) / self.scale
+        return (TAIL + 1) / TAIL / self.scale**2 / (1 + z**2 / TAIL)
+
+    def inside(self, values):
+        return bool((values >= self.low).all() and (values <= self.high).all())
+
+
+class Usual:
+    """What a machine usually does: force (nv,), speed (nv,) and travel (nv,) of each dof, forces asked of actuators."""
+
+    def __init__(self, world, recordings, force):
+        model = world.model
+        states = [cut.states(model, r) for r in recordings]
+        qvel = np.concatenate([v for _, v in states])
+        gone = [cut.difference(model, np.broadcast_to(model.qpos0, q.shape), q) for q, _ in states]
+        gone = np.concatenate(gone)
+        self.model, self.force, self.recordings = model, force, recordings
+        self.speed = np.sqrt(np.mean(qvel**2, axis=0)) + 1e-9
+        self.travel = np.quantile(abs(gone), 0.95, axis=0) + 1e-9
+        self.range = np.ptp(np.quantile(gone, [0.01, 0.99], axis=0), axis=0) + 1e-9
+
+    def dof(self, place):
+        """The dof of a joint's place, or of the joint an actuator acts on; None elsewhere."""
+        if place.kind == "joint":
+            return self.model.jnt_dofadr[self.model.joint(place.name).id]
+        if place.kind == "actuator":
+            i = self.model.actuator(place.name).id
+            if ActuatorEffect.on_joint(self.model, i):
+                return self.model.jnt_dofadr[self.model.actuator_trnid[i, 0]]
+        return None
+
+    def unit(self, kind, candidate):
+        """Size of a unit of the table for a candidate."""
+        place, model, d = candidate.place, self.model, self.dof(candidate.place)
+        if kind == "plain":
+            return 1.0
+        if kind == "size":
+            return _size(model, model.body(place.name).id)
+        if kind == "weight":
+            return 10.0 * model.body_subtreemass[model.body(place.name).id]
+        if kind in ("used", "strength"):
+            i = model.actuator(place.name).id
+            used = np.quantile(ActuatorEffect.forces(model, i, self.recordings), 0.995)
+            servo = model.actuator_biasprm[i, 1:3].any()
+            motor = candidate.effect.name == "dead_zone" and not servo
+            return max(used, 1e-9) / (abs(model.actuator_gainprm[i, 0]) if motor else 1.0)
+        if d is None:
+            return np.inf
+        gear = 1.0
+        if place.kind == "actuator":
+            gear = abs(model.actuator_gear[model.actuator(place.name).id, 0]) or 1.0
+        return {
+            "force": self.force[d],
+            "inertia": model.dof_M0[d],
+            "per speed": self.force[d] / self.speed[d] / gear**2,
+            "per speed²": self.force[d] / self.speed[d] ** 2,
+            "per travel": self.force[d] / self.travel[d],
+            "per travel³": self.force[d] / self.travel[d] ** 3,
+            "travel": self.range[d],
+        }[kind]
+
+
+def plausible(candidate, usual):
+    """The Prior of a candidate on a machine. An effect without a row may have any value its parameters allow."""
+    parameters = candidate.parameters
+    nominal = np.array([p.nominal for p in parameters], float)
+    rows = TABLE.get(candidate.effect.name, [("plain", np.inf, -np.inf, np.inf)])
+    rows = rows if len(rows) == len(parameters) else rows * len(parameters)
+    scale, low, high = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
+    for k, (kind, s, a, b) in enumerate(rows):
+        ratio = kind == "times"
+        unit = abs(nominal[k]) if ratio else usual.unit(kind, candidate)
+        shift = nominal[k] if candidate.effect.name in AWAY else 0.0
+        ends = np.array([a, b]) * unit + shift if np.isfinite(unit) else (-np.inf, np.inf)
+        scale[k] = s * unit if np.isfinite(s * unit) and s * unit > 0 else np.inf
+        low[k], high[k] = max(min(ends), parameters[k].low), min(max(ends), parameters[k].high)
+        if np.isfinite(nominal[k]):
+            low[k], high[k] = min(low[k], nominal[k]), max(high[k], nominal[k])
+    return Prior(np.where(np.isfinite(nominal), nominal, 0.0), scale, low, high)
+
+
+def possible(candidate, values, prior):
+    """Whether values are inside the bounds, and physics as a whole: gravity may tilt, but hardly change its strength."""
+    if not prior.inside(np.asarray(values)):
+        return False
+    if candidate.effect.name == "gravity" and np.linalg.norm(candidate.nominal) > 0:
+        ratio = np.linalg.norm(values) / np.linalg.norm(candidate.nominal)
+        return abs(ratio - 1) <= STRENGTH
+    return bool(candidate.effect.possible(values, candidate.nominal))
