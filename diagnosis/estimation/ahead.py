@@ -10,9 +10,9 @@ import numpy as np
 from diagnosis.estimation import windows as cut
 
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
-FEWEST = 8  # windows that there should be, if shorter ones make up for it
+FEWEST = 16  # windows that there should be, if shorter ones make up for it
 MOST = 48  # windows that are simulated, evenly chosen of more
-GROUPS = 12  # of neighbouring windows, the units that are left out and compared
+GROUPS = 16  # of neighbouring windows, the units that are left out and compared
 
 
 def cut_ahead(recordings, longest=HORIZONS[-1]):
@@ -29,7 +29,7 @@ class Ahead:
 
     measured (W, T, nq), known (W, T, nv); band (W, T): index of the horizon that a row's time ahead
     falls into, -1 for none; group (W,): which windows are left out together; channels: [dofs];
-    travel (nv,): recorded range, beyond which a prediction is lost.
+    travel (nv,): three times what is gone in a window, beyond which a prediction is lost.
     """
 
     def __init__(self, world, windows, noise):
@@ -64,7 +64,7 @@ class Ahead:
         start = self.measured[:, :1]
         gone = np.abs(cut.difference(self.model, np.broadcast_to(start, self.measured.shape), self.measured))
         gone = np.where(np.isfinite(gone), gone, 0.0).reshape(-1, self.model.nv)
-        return np.maximum(np.quantile(gone, 0.98, axis=0), 10 * np.where(np.isfinite(self.noise), self.noise, 1.0))
+        return np.maximum(3 * np.quantile(gone, 0.98, axis=0), 10 * np.where(np.isfinite(self.noise), self.noise, 1.0))
 
     def start(self, trajectory):
         """Begin the windows at a Trajectory's states."""

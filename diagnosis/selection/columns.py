@@ -16,6 +16,7 @@ from diagnosis.selection.plausibility import plausible
 TOGETHER = 12  # settings that are simulated in one call
 FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column stands for it
 PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
+LADDER = 0.1, 0.4  # shares of a prior's scale
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
 
 
@@ -62,7 +63,7 @@ class Columns:
         self.ahead, self.setting, self.usual, self.world = ahead, setting, usual, ahead.world
         self.settings, self.options, self.simulated = [{}], [], 0
         self.residual = ahead.residual([setting])[0]
-        self.lost = (abs(self.residual) >= ahead.travel).any(1)  # (W, nv): told by no slope
+        self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts, starts = [], []
         for candidate in candidates:
             starts += self._starts(candidate)
@@ -84,7 +85,7 @@ class Columns:
             out = [one] if one else []
             if inside:
                 return out
-            whole = list(world.far(candidate, recordings))
+            whole = list(world.far(candidate, recordings)) + self._ladder(base, prior)
         else:
             out, whole = [], list(world.probes(candidate, recordings))
         together = candidate.effect.together
@@ -103,6 +104,13 @@ class Columns:
             if all(prior.inside(row) for row in rows):
                 out.append((candidate, start, directions, low, high, prior, together > 1))
         return out
+
+    @staticmethod
+    def _ladder(base, prior):
+        """Full-size values of a parameter that only goes one way: what sticks or waits shows in no small step."""
+        if len(base) > 1 or base[0] > prior.low[0] or not np.isfinite(prior.scale[0]):
+            return []
+        return [base + share * prior.scale for share in LADDER]
 
     @staticmethod
     def _proportional(candidate, base, prior):
@@ -129,8 +137,7 @@ class Columns:
             self.simulated += len(settings)
             for gap in found:
                 change = self.residual - gap
-                far = (abs(gap) >= self.ahead.travel).any(1) | self.lost
-                change[np.broadcast_to(far[:, None], change.shape)] = 0.0
+                change[self.lost | (abs(gap) >= self.ahead.travel)] = 0.0
                 changes.append(change.astype(np.float32))
         at = 0
         for start in starts:

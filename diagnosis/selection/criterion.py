@@ -45,8 +45,9 @@ def paired(before, after):
     n = len(d)
     spread = float(np.std(d, ddof=1) / np.sqrt(n)) if n > 1 else np.inf
     gain = float(before.loss - after.loss)
-    t = d.mean() / spread if spread > 0 else np.sign(d.mean()) * np.inf
-    return Comparison(gain, spread, float(stats.t.sf(t, max(n - 1, 1))) if d.any() else 1.0)
+    if not spread > 0 or not np.isfinite(spread):
+        return Comparison(gain, spread, 1.0)
+    return Comparison(gain, spread, float(stats.t.sf(d.mean() / spread, n - 1)))
 
 
 class Evidence:

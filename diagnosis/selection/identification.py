@@ -87,12 +87,13 @@ class Identification:
         now = judge.fit(setting)
         judged = [now]
         for node in self._finalists(beam, start, nodes):
-            fitted = judge.fit(beam.setting(node))
+            fitted = judge.fit(beam.setting(node), steps=3)
             self.log(f"  linear {node.loss:.3f} judged {fitted.loss:.3f} {said(fitted.setting)}")
             judged.append(fitted)
-        best = self._choose(judged, now, len(nodes))
+        number = len({o.candidate for o in columns.options})
+        best = self._choose(judged, now, number)
         if best is not now:
-            best = self._pruned(judge, best)
+            best = self._pruned(judge, judge.fit(best.setting))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         return best, best is not now, [] if setting else self._ranking(beam, start)
 
@@ -130,7 +131,7 @@ class Identification:
     def earned(self, before, after, number=1):
         """Whether a set removes enough of the loss, and by more than groups scatter, for the number looked at."""
         step = paired(before.score, after.score)
-        return step.gain >= EARNS and step.p_value < LEVEL / max(number, 1) ** 0.5
+        return step.gain >= EARNS and step.p_value < LEVEL / number
 
     def _pruned(self, judge, fitted):
         """Without the effects that do not earn their place beside the others."""
@@ -140,6 +141,8 @@ class Identification:
                 for out in fitted.setting
             ]
             less = min(tries, key=lambda f: f.loss)
+            step = paired(less.score, fitted.score)
+            self.log(f"  without: {less.loss:.3f} {said(less.setting)}; {step.gain:.3f} ± {step.spread:.3f}, p {step.p_value:.2g}")
             if self.earned(less, fitted):
                 break
             fitted = less
