@@ -8,7 +8,6 @@ The error is the contract's (windows.error): consecutive windows, start as recor
 
 import numpy as np
 
-from diagnosis.estimation import initial_states, residuals
 from diagnosis.estimation import windows as cut
 
 DRAWS = 4  # of noise, for what a perfect simulator would miss
@@ -30,10 +29,10 @@ def prediction_error(world, settings, recordings, noise):
     return cut.error(world.model, windows, predict(world, settings, windows)[0], noise)
 
 
-def floor_error(world, settings, recordings, position_noise, velocity_noise):
+def floor_error(world, settings, smoother, trajectory):
     """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}), and how far the square of the
     former scatters between recordings of the same motion, noise being what it is (a standard deviation)."""
-    gap = floor_gaps(world, settings, recordings, position_noise, velocity_noise)[:, 1:]
+    gap = floor_gaps(world, settings, smoother, trajectory)[:, 1:]
     known = np.isfinite(gap)
     square = np.where(known, gap**2, 0.0)
     per_channel = {
@@ -41,7 +40,7 @@ def floor_error(world, settings, recordings, position_noise, velocity_noise):
         for name, dofs in cut.channels(world.model).items()
         if known[..., dofs].any()
     }
-    noise = reporting_noise(position_noise)
+    noise = reporting_noise(smoother.position_noise)
     total, count = (square / noise**2).sum((1, 2)).reshape(DRAWS, -1), max(known.sum(), 1)
     scatter = (
         np.sqrt(total.var(axis=0, ddof=1).sum()) * DRAWS / count
@@ -49,29 +48,18 @@ def floor_error(world, settings, recordings, position_noise, velocity_noise):
     return float(np.sqrt(total.sum() / count)), per_channel, float(scatter)
 
 
-def floor_gaps(world, settings, recordings, position_noise, velocity_noise, horizon=cut.HORIZON):
+def floor_gaps(world, settings, smoother, trajectory, horizon=cut.HORIZON):
     """What a perfect simulator would miss in the windows, or some of many: (DRAWS W, T, nv), NaN where nothing was measured.
 
-    The corrected model from start states fitted to the first 0.3 s, from one row before each window on, stands for the
-    truth. It is measured anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
-    by differences; DRAWS times, for noise alone makes this vary.
+    The corrected model from smoothed states, from one row before each window on, stands for the truth. It is measured
+    anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities by differences; DRAWS
+    times, for noise alone makes this vary.
     """
     rng, model = np.random.default_rng(0), world.model
-    windows = sparse(consecutive(recordings, horizon))
+    windows = sparse(consecutive(smoother.recordings, horizon))
     early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
-    ends = [
-        int(
-            np.searchsorted(
-                w.recording.time, w.recording.time[w.first] + cut.HORIZON * (1 + 1e-6), "right"
-            )
-        )
-        - 1
-        for w in windows
-    ]
-    begun = [w._replace(last=max(min(w.last, end), w.first + 1)) for w, end in zip(early, ends)]
-    problem = residuals.Problem(world, begun, position_noise, velocity_noise)
-    fit = initial_states.fit(problem, residuals.Hypothesis(tuple(settings.items())), sharp=False)
-    truth, speed = predict(world, settings, early, (fit.qpos, fit.qvel))
+    truth, speed = predict(world, settings, early, trajectory.at(early))
+    position_noise, velocity_noise = smoother.position_noise, smoother.velocity_noise
     finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
     every, at = (
         np.arange(len(windows)),
@@ -101,15 +89,15 @@ def reporting_noise(position_noise):
 
 
 def curve(
-    world, settings, recordings, position_noise, velocity_noise, longest=3 * cut.HORIZON, points=15
+    world, settings, smoother, trajectory, longest=3 * cut.HORIZON, points=15
 ):
     """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t up to `longest`.
 
     Windows in which a prediction blew up before t are left out of its error there and counted, with all that were measured
     then: "blown_up": {"before":, "after":, "of":}, where there are any.
     """
-    noise = reporting_noise(position_noise)
-    windows = consecutive(recordings, longest)
+    noise = reporting_noise(smoother.position_noise)
+    windows = consecutive(smoother.recordings, longest)
     seconds = [w.recording.time[w.first : w.last + 1] - w.recording.time[w.first] for w in windows]
     sample = np.median([s[-1] / (len(s) - 1) for s in seconds])
     most = max(1, round(max(s[-1] for s in seconds) / sample))
@@ -121,7 +109,7 @@ def curve(
     gaps = {
         name: cut.position_residual(world.model, windows, qpos) for name, qpos in predicted.items()
     }
-    gaps["floor"] = floor_gaps(world, settings, recordings, position_noise, velocity_noise, longest)
+    gaps["floor"] = floor_gaps(world, settings, smoother, trajectory, longest)
     out = []
     for time in sample * np.unique(np.linspace(1, most, min(points, most)).round()):
         rows = np.array(

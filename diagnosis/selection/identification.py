@@ -18,7 +18,7 @@ from diagnosis.selection.judge import Fitted, Judge
 from diagnosis.selection.plausibility import Usual
 
 ROUNDS = 4
-EARNS = 0.05  # nats of log RMS error, summed over channels, that an effect has to remove
+EARNS = 0.1  # nats of log RMS error, summed over channels, that an effect has to remove
 LEVEL = 0.05  # of false additions in all that is looked at
 FINALISTS = 6  # sets that the simulator judges in a round
 
@@ -93,7 +93,7 @@ class Identification:
         number = len({o.candidate for o in columns.options})
         best = self._choose(judged, now, number)
         if best is not now:
-            best = self._pruned(judge, judge.fit(best.setting))
+            best = self.pruned(judge, judge.fit(best.setting))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         return best, best is not now, [] if setting else self._ranking(beam, start)
 
@@ -133,7 +133,7 @@ class Identification:
         step = paired(before.score, after.score)
         return step.gain >= EARNS and step.p_value < LEVEL / number
 
-    def _pruned(self, judge, fitted):
+    def pruned(self, judge, fitted):
         """Without the effects that do not earn their place beside the others."""
         while len(fitted.setting) > 1:
             tries = [
@@ -150,13 +150,14 @@ class Identification:
 
     @staticmethod
     def _ranking(beam, start):
-        """[(candidate, share of log error removed alone)]."""
+        """[(candidate, loss removed alone, p-value)], most first."""
         best = {}
         for k in beam.free:
-            node = beam.node((*beam.kept, k))
-            c = beam.columns.options[k].candidate
-            best[c] = max(best.get(c, 0.0), start.loss - node.loss)
-        return sorted(best.items(), key=lambda item: -item[1])
+            node, c = beam.node((*beam.kept, k)), beam.columns.options[k].candidate
+            gain = start.loss - node.loss
+            if c not in best or gain > best[c][0]:
+                best[c] = gain, paired(start.score, node.score).p_value
+        return sorted(((c, *each) for c, each in best.items()), key=lambda item: -item[1])
 
 
 def complexity(setting):

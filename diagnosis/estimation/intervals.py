@@ -1,0 +1,71 @@
+"""95 % intervals that allow for dependence within groups of windows and for few groups.
+
+bounds = intervals(fitted)          # {candidate: [(low, high) or None, ...]}
+
+The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees of
+freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipton, JBES 36 (2018).
+"""
+
+import numpy as np
+from scipy import stats
+
+UNSEEN = 1e-8  # share of a column's information that the others leave, below which it is not seen
+
+
+def intervals(fitted):
+    """{candidate: [(low, high), ...]} of a Fitted set; None for a parameter that the recordings do not show."""
+    evidence, out = fitted.evidence, {}
+    options = fitted.columns.options
+    index = np.concatenate([[0], *[np.array(o.columns) + 1 for o in options]]).astype(int)
+    half, shift = half_widths(evidence, index)
+    at = 0
+    for c, values in fitted.setting.items():
+        out[c] = [None] * len(values)
+        option = next((o for o in options if o.candidate is c), None)
+        if option is None:
+            continue
+        for row in option.directions:
+            k = int(np.flatnonzero(row)[0])
+            middle = values[k] + shift[at] * row[k]
+            width = half[at] * abs(row[k])
+            if np.isfinite(width):
+                low, high = option.prior.low[k], option.prior.high[k]
+                out[c][k] = (float(max(middle - width, low)), float(min(middle + width, high)))
+            at += 1
+    return out
+
+
+def half_widths(evidence, index):
+    """Half widths and remaining Gauss-Newton moves (p,) of columns index[1:] about amounts zero."""
+    p = len(index) - 1
+    if not p:
+        return np.zeros(0), np.zeros(0)
+    weight = evidence._weight(index, np.zeros(p))
+    each = np.einsum("gc,gcij->gij", weight, evidence.gram[:, :, index][..., index])
+    scale = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], 1e-300))
+    gram, score = each[:, 1:, 1:] / np.outer(scale, scale), each[:, 1:, 0] / scale
+    whole = gram.sum(0)
+    values, vectors = np.linalg.eigh(whole)
+    seen = values > UNSEEN
+    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+    unseen = np.diag(np.eye(p) - vectors[:, seen] @ vectors[:, seen].T) > 0.5
+    moves = inverse @ score.sum(0)
+    left = score - gram @ moves
+    root = (vectors[:, seen] / np.sqrt(values[seen])) @ vectors[:, seen].T
+    back = (vectors[:, seen] * np.sqrt(values[seen])) @ vectors[:, seen].T
+    meat = np.zeros((p, p))
+    shares = np.empty((len(gram), p))
+    for g, (H, s) in enumerate(zip(gram, left)):
+        hat = root @ H @ root
+        e, u = np.linalg.eigh(hat)
+        factor = (u / np.sqrt(np.clip(1 - e, 0.05, 1.0))) @ u.T
+        corrected = back @ factor @ root @ s
+        meat += np.outer(corrected, corrected)
+        shares[g] = np.einsum("ij,jk,ki->i", inverse, H, inverse) / np.maximum(
+            np.diag(inverse), 1e-300
+        )
+    covariance = inverse @ meat @ inverse
+    freedom = np.maximum(1 / np.maximum((shares**2).sum(0), 1e-9) - 1, 1.0)
+    half = stats.t.ppf(0.975, freedom) * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    half[unseen] = np.inf
+    return half / scale, moves / scale
