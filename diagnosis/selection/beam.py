@@ -63,16 +63,17 @@ class Beam:
             beam = sorted(grown, key=lambda n: n.loss)[:WIDTH]
         return start, sorted(met.values(), key=lambda n: n.loss)
 
-    def _looks(self, node):
-        """Indices of the further options with most gain in a first look."""
+    def gains(self, node):
+        """Nats that every option promises beside a node's, in a first look: a list."""
         index, *_, precision, _ = problem(self.columns, node.options)
         gain = self.evidence.looks(index, node.score.amounts, precision)
+        return [gain[list(o.columns)].sum() for o in self.columns.options]
+
+    def _looks(self, node):
+        """Indices of the further options with most gain in a first look."""
+        gain = self.gains(node)
         taken = {self.columns.options[k].candidate for k in node.options}
-        each = {
-            k: gain[list(self.columns.options[k].columns)].sum()
-            for k in self.free
-            if self.columns.options[k].candidate not in taken
-        }
+        each = {k: gain[k] for k in self.free if self.columns.options[k].candidate not in taken}
         best, seen = [], {}
         for k in sorted(each, key=lambda k: -each[k]):
             candidate = self.columns.options[k].candidate

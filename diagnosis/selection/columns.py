@@ -13,7 +13,7 @@ import numpy as np
 
 from diagnosis.selection.plausibility import plausible
 
-TOGETHER = 12  # settings that are simulated in one call
+TOGETHER = 40  # settings that are simulated in one call
 FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column stands for it
 PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
@@ -59,10 +59,12 @@ class Option:
 class Columns:
     """Simulates the columns of candidates about a setting. residual (W, T, nv); array (W, T, nv, K); options."""
 
-    def __init__(self, ahead, setting, usual, candidates):
+    def __init__(self, ahead, setting, usual, candidates, residual=None, seen=None):
+        """residual: of the setting, if it is known; seen: {candidate: which of its parameters show}, of earlier looks."""
         self.ahead, self.setting, self.usual, self.world = ahead, setting, usual, ahead.world
-        self.settings, self.options, self.simulated = [{}], [], 0
-        self.residual = ahead.residual([setting])[0]
+        self.options, self.simulated = [], int(residual is None)
+        self.seen = {} if seen is None else seen
+        self.residual = ahead.residual([setting])[0] if residual is None else residual
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts, starts = [], []
         for candidate in candidates:
@@ -81,7 +83,7 @@ class Columns:
         inside = candidate in self.setting
         base = np.array(self.setting.get(candidate, candidate.nominal), float)
         if inside or not candidate.effect.overrides("probes"):
-            one = self._proportional(candidate, base, prior)
+            one = self._proportional(candidate, base, prior, self.seen.get(candidate, True))
             out = [one] if one else []
             if inside:
                 return out
@@ -113,10 +115,10 @@ class Columns:
         return [base + share * prior.scale for share in LADDER]
 
     @staticmethod
-    def _proportional(candidate, base, prior):
+    def _proportional(candidate, base, prior, shown):
         steps = np.array([p.step for p in candidate.parameters])
         steps = np.where((base + steps > prior.high) | ~np.isfinite(steps), -abs(steps), steps)
-        fits = (base + steps >= prior.low) & np.isfinite(base)
+        fits = (base + steps >= prior.low) & np.isfinite(base) & shown
         if not fits.any():
             return None
         directions = np.diag(steps)[fits]
@@ -126,6 +128,7 @@ class Columns:
 
     def _simulate(self, starts):
         """Simulate starts; those that change nothing are left out."""
+        starts = sorted(starts, key=lambda start: start[0].effect.overrides("force"))
         jobs = [(s, row) for s, start in enumerate(starts) for row in start[2]]
         changes = []
         for k in range(0, len(jobs), TOGETHER):
@@ -143,7 +146,8 @@ class Columns:
         for start in starts:
             own = changes[at : at + len(start[2])]
             at += len(own)
-            seen = np.array([self._seen(c) for c in own])
+            seen = np.array([self._shows(c) for c in own])
+            self._remember(start, seen)
             if not seen.any() or (start[6] and not seen.all()):
                 continue
             columns = tuple(range(len(self.parts), len(self.parts) + seen.sum()))
@@ -153,7 +157,14 @@ class Columns:
                 Option(candidate, base, directions[seen], columns, low[seen], high[seen], prior, merges)
             )
 
-    def _seen(self, change):
+    def _remember(self, start, shows):
+        """Keep which parameters of a candidate show at all, so that later columns leave out the others."""
+        candidate, base, directions = start[:3]
+        single = (directions != 0).sum(1) == 1
+        if single.all() and candidate not in self.seen and len(base) > 1 and shows.any():
+            self.seen[candidate] = (directions[shows] != 0).any(0)
+
+    def _shows(self, change):
         """Whether a column says anything: more than rounding, beside the noise."""
         noise = np.where(np.isfinite(self.ahead.noise), self.ahead.noise, np.inf)
         return bool((np.sqrt(np.mean(change**2, axis=(0, 1))) > 1e-6 * noise).any())

@@ -16,11 +16,13 @@ from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, paired
 from diagnosis.selection.judge import Fitted, Judge
 from diagnosis.selection.plausibility import Usual
+from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
 EARNS = 0.1  # nats of log RMS error, summed over channels, that an effect has to remove
 LEVEL = 0.05  # of false additions in all that is looked at
-FINALISTS = 6  # sets that the simulator judges in a round
+IDLE = 1.0  # nats that an effect must promise beside those chosen, to be looked at in further rounds
+FINALISTS = 4  # sets that the simulator judges in a round
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
+        self.seen, self.idle = {}, set()
         self.candidates = [
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
         ]
@@ -57,26 +60,32 @@ class Identification:
         self.usual = Usual(self.world, self.train, smoother.scale)
         self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
         setting, ranking = {}, []
+        offered = [c for c in self.candidates if not c.effect.overrides("force")]
         for i in range(ROUNDS):
             self.ahead.start(trajectory)
-            self.say(0.1 + 0.2 * i, f"searching {len(self.candidates)} candidates")
-            fitted, better, look = self._round(setting)
+            self.say(0.1 + 0.15 * i, f"searching {len(offered)} candidates")
+            fitted, better, look = self._round(setting, offered)
             ranking = ranking or look
-            if not better:
+            if better:
+                setting = fitted.setting
+                trajectory = smoother.locate(setting, trajectory, passes=1)
+            elif len(offered) < len(self.candidates) and dependences(self.world, trajectory, self.train):
+                offered = self.candidates  # those that are dear to simulate, where something is left
+            else:
                 break
-            setting = fitted.setting
-            trajectory = smoother.locate(setting, trajectory, passes=1)
         self.ahead.start(trajectory)
         judge = Judge(self.ahead, self.usual)
+        judge.seen = self.seen
         fitted = judge.fit(setting)
         bare = judge.fit({})
         return Found(
             fitted, bare, trajectory, first, smoother, self.ahead, self.usual, judge, ranking
         )
 
-    def _round(self, setting):
+    def _round(self, setting, offered):
         """(Fitted, whether it is better than what there was, first ranking)."""
-        columns = Columns(self.ahead, setting, self.usual, self.candidates)
+        candidates = [c for c in offered if c not in self.idle] + [c for c in setting if c not in offered]
+        columns = Columns(self.ahead, setting, self.usual, candidates, seen=self.seen)
         evidence = Evidence(self.ahead, columns.residual, columns.array)
         columns.secants(evidence)
         evidence = Evidence(self.ahead, columns.residual, columns.array, evidence.floor)
@@ -84,6 +93,7 @@ class Identification:
         start, nodes = beam.nodes()
         self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}")
         judge = Judge(self.ahead, self.usual, evidence.floor)
+        judge.seen = self.seen
         now = judge.fit(setting)
         judged = [now]
         for node in self._finalists(beam, start, nodes):
@@ -95,7 +105,22 @@ class Identification:
         if best is not now:
             best = self.pruned(judge, judge.fit(best.setting))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
+            self._set_aside(beam, columns, best)
         return best, best is not now, [] if setting else self._ranking(beam, start)
+
+    def _set_aside(self, beam, columns, chosen):
+        """Leave out of further rounds what would have added nothing beside the chosen effects."""
+        options = [
+            k
+            for c in chosen.setting
+            for k in [k for k, o in enumerate(columns.options) if o.candidate is c][-1:]
+        ]
+        node = beam.node(options)
+        gain = beam.gains(node)
+        for candidate in self.candidates:
+            own = [gain[k] for k, o in enumerate(columns.options) if o.candidate is candidate]
+            if candidate not in chosen.setting and max(own, default=0.0) < IDLE:
+                self.idle.add(candidate)
 
     def _finalists(self, beam, start, nodes):
         """Nodes for the simulator: the best, and the best of each first effect and each size."""

@@ -38,14 +38,16 @@ class Judge:
 
     def __init__(self, ahead, usual, reference=None):
         self.ahead, self.usual, self.reference = ahead, usual, reference
-        self.simulated = 0
+        self.simulated, self.seen = 0, {}
 
     def fit(self, setting, steps=STEPS):
         """The Fitted values of a set of effects, begun at the values given."""
-        setting = {c: self._inside(c, v) for c, v in setting.items()}
+        setting, residual = {c: self._inside(c, v) for c, v in setting.items()}, None
         for left in range(steps, -1, -1):
-            columns = Columns(self.ahead, setting, self.usual, list(setting))
-            self.simulated += columns.simulated + 1
+            columns = Columns(
+                self.ahead, setting, self.usual, list(setting), residual, self.seen
+            )
+            self.simulated += columns.simulated
             evidence = Evidence(self.ahead, columns.residual, columns.array, self.reference)
             index, low, high, precision, pull = problem(columns, range(len(columns.options)))
             score = evidence.score(index, low, high, precision, pull)
@@ -53,7 +55,7 @@ class Judge:
             better = self._lower(columns, evidence, score.amounts, setting) if left else None
             if better is None:
                 break
-            setting = better
+            setting, residual = better
         prior = self.cost(setting) / evidence.number
         # values of left-out groups deviate by no more than those fitted without them
         final = Score(score.loss + prior, score.groups + prior, score.amounts)
@@ -62,7 +64,7 @@ class Judge:
         return Fitted(setting, final, columns, evidence)
 
     def _lower(self, columns, evidence, amounts, setting):
-        """The setting after a step that lowers the loss by more than DONE, or None."""
+        """(setting, residual) after a step that lowers the loss by more than DONE, or None."""
         inside = self._whole(columns.residual, setting, evidence)
         share = 1.0
         for _ in range(HALVINGS):
@@ -71,7 +73,7 @@ class Judge:
                 residual = self.ahead.residual([moved])[0]
                 self.simulated += 1
                 if self._whole(residual, moved, evidence) < inside - DONE:
-                    return moved
+                    return moved, residual
             share /= 3
         return None
 

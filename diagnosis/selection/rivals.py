@@ -10,6 +10,7 @@ from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.identification import EARNS, complexity
 
 ALIKE = 0.7  # cosine of two effects' columns beside the other findings', from which on one may stand for the other
+FURTHER = 2.5  # how much more complex another member of a class may be: three components for one number
 MOST = 3  # others that are told, of twice as many that are refitted
 
 
@@ -84,10 +85,13 @@ def _alike(judge, fitted, candidate, pool):
 def _near(world, candidate, pool):
     """Candidates of a pool that act where a finding does, or everywhere."""
     mine = world.joints(candidate.place)
+    most = len(candidate.parameters) + candidate.effect.simplicity / 2 + FURTHER
     related = set(world.related(candidate))
     out = []
     for other in pool:
         theirs = world.joints(other.place)
+        if len(other.parameters) + other.effect.simplicity / 2 > most:
+            continue
         if other in related or mine is None or theirs is None or mine & theirs:
             out.append(other)
     return out
