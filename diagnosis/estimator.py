@@ -78,7 +78,9 @@ def _checked(search, found, fitted, others, log):
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=2)
         if not search.earned(fitted, beside, len(search.candidates)):
             continue
-        log(f"  a curve beside the names: {rest.joint} {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
+        log(
+            f"  a curve beside the names: {rest.joint} {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}"
+        )
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         size = _force(found, trajectory, world, rest.joint)
         if not mine or rest.size > MATTERS * size:
@@ -130,4 +132,3 @@ def _hand_over(world, train, held, outcome, log):
     outcome.held_check = check
     outcome.train_check = Check(world, train, outcome.found.smoother, kept)
     outcome.train_check.trajectory = outcome.trajectory
-

@@ -14,7 +14,9 @@ from diagnosis.estimation import windows as cut
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 
-SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing unexplained
+SCATTER = (
+    2.0  # standard deviations of a perfect simulator's squared error, that are nothing unexplained
+)
 MUCH = 0.2  # share of the nominal error's square, above which what is left is unexplained
 POINTS = 400  # of a located force that are told
 
@@ -48,7 +50,9 @@ def assemble(world, train, held_out, outcome):
         world, settings, check.smoother, check.trajectory
     )
     findings = [_finding(world, c, outcome, bounds, figures["held_out"]) for c in settings]
-    findings.sort(key=lambda f: (f["effect"] != "unknown" , -f["evidence"]["held_out_error_removed"]))
+    findings.sort(
+        key=lambda f: (f["effect"] != "unknown", -f["evidence"]["held_out_error_removed"])
+    )
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
     left = unexplained(figures["held_out"], check.scatter)
     hint = outcome.left[0] if outcome.left else None
@@ -84,13 +88,21 @@ def verdict(findings, left):
     """match, mismatch, or unresolved: something is missing and no name explains it well enough."""
     if not findings:
         return "unresolved" if left > MUCH else "match"
-    return "mismatch" if findings[0]["effect"] != "unknown" and findings[0]["adequate"] else "unresolved"
+    return (
+        "mismatch"
+        if findings[0]["effect"] != "unknown" and findings[0]["adequate"]
+        else "unresolved"
+    )
 
 
 def _finding(world, candidate, outcome, bounds, figure):
     values, handed = outcome.fitted.setting[candidate], outcome.handed
     curve = candidate.effect.name == "unknown"
-    form = {key: getattr(candidate.effect, key) for key in ("variable", "factor", "wave")} if curve else None
+    form = (
+        {key: getattr(candidate.effect, key) for key in ("variable", "factor", "wave")}
+        if curve
+        else None
+    )
     before, after = figure["before"], figure["after"]
     rest = outcome.adequacy.get(candidate)
     return {
@@ -169,7 +181,10 @@ def _figure(world, handed: Handed, check, settings):
     """Errors before, after (of the files handed over, in stock MuJoCo) and of a perfect simulator, as diagnosis.json has them."""
     model, noise = world.model, check.noise
     out, channels = {}, {}
-    for name, gaps in (("before", check.gaps(handed.nominal)), ("after", check.gaps(handed.model, handed.step))):
+    for name, gaps in (
+        ("before", check.gaps(handed.nominal)),
+        ("after", check.gaps(handed.model, handed.step)),
+    ):
         out[name], per_channel = check.rms(gaps)
         for channel, value in per_channel.items():
             channels.setdefault(channel, {})[name] = value
@@ -196,7 +211,9 @@ def depends_on(model, candidate):
     variable, name = candidate.effect.acts_through, candidate.place.name
     if variable == "velocity" and candidate.place.kind == "actuator":
         actuator = model.actuator(name)
-        if actuator.trntype[0] not in JOINT_TRANSMISSIONS:  # a site or tendon moves with many joints
+        if (
+            actuator.trntype[0] not in JOINT_TRANSMISSIONS
+        ):  # a site or tendon moves with many joints
             return []
         name = cut.joint_name(model, actuator.trnid[0])
     return [f"{variable}:{name}"] if variable else []
@@ -209,7 +226,10 @@ def missing_force(world, outcome):
     for j, kind, _, v in cut.joint_slices(model):
         name = cut.joint_name(model, j)
         for i, d in enumerate(range(v.start, v.stop)):
-            rms = [float(np.sqrt(np.mean(t.force[~t.free, d] ** 2))) if (~t.free).any() else None for t in (first, last)]
+            rms = [
+                float(np.sqrt(np.mean(t.force[~t.free, d] ** 2))) if (~t.free).any() else None
+                for t in (first, last)
+            ]
             linear = kind.name == "mjJNT_SLIDE" or (kind.name == "mjJNT_FREE" and i < 3)
             depends = next((f.variables for f in outcome.dependences if f.joint == name), ())
             out[name if v.stop - v.start == 1 else f"{name}:{i}"] = {

@@ -83,5 +83,7 @@ def accepted(world, check, setting, log=lambda what: None):
         worst = min(held, key=lambda c: without[c], default=None)
         if worst is None or without[worst] > after and after < before:
             return Handed(setting, xml, python, model, step, nominal, forms, without)
-        log(f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with, {before:.4g} nominal")
+        log(
+            f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with, {before:.4g} nominal"
+        )
         setting = {c: v for c, v in setting.items() if c is not worst}

@@ -62,9 +62,14 @@ class Ahead:
 
     def _travel(self):
         start = self.measured[:, :1]
-        gone = np.abs(cut.difference(self.model, np.broadcast_to(start, self.measured.shape), self.measured))
+        gone = np.abs(
+            cut.difference(self.model, np.broadcast_to(start, self.measured.shape), self.measured)
+        )
         gone = np.where(np.isfinite(gone), gone, 0.0).reshape(-1, self.model.nv)
-        return np.maximum(3 * np.quantile(gone, 0.98, axis=0), 10 * np.where(np.isfinite(self.noise), self.noise, 1.0))
+        return np.maximum(
+            3 * np.quantile(gone, 0.98, axis=0),
+            10 * np.where(np.isfinite(self.noise), self.noise, 1.0),
+        )
 
     def start(self, trajectory):
         """Begin the windows at a Trajectory's states."""

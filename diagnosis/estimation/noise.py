@@ -8,7 +8,9 @@ import numpy as np
 
 from diagnosis.estimation.windows import channels, difference, joint_slices, pooled
 
-ORDERS = range(2, 7)  # of differences: what a smooth motion leaves falls with the order, noise does not
+ORDERS = range(
+    2, 7
+)  # of differences: what a smooth motion leaves falls with the order, noise does not
 STRIDES = 1, 2, 4  # rows apart: noise that was filtered before it was stored shows in coarser rows
 WHITE = 0.6  # ratio of the last to the second estimate, above which noise is taken to be white
 

@@ -88,9 +88,7 @@ def reporting_noise(position_noise):
     return np.where(np.isfinite(position_noise), np.maximum(position_noise, 1e-12), 1.0)
 
 
-def curve(
-    world, settings, smoother, trajectory, longest=3 * cut.HORIZON, points=15
-):
+def curve(world, settings, smoother, trajectory, longest=3 * cut.HORIZON, points=15):
     """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t up to `longest`.
 
     Windows in which a prediction blew up before t are left out of its error there and counted, with all that were measured

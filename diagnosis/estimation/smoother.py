@@ -66,7 +66,9 @@ class Smoother:
         states = [cut.states(model, r) for r in recordings]
         self.qpos, self.qvel = (np.concatenate(x) for x in zip(*states))
         measured_q = np.concatenate([r.qpos for r in recordings])
-        self.position = cut.difference(model, self.qpos, np.where(np.isfinite(measured_q), self.qpos, np.nan))
+        self.position = cut.difference(
+            model, self.qpos, np.where(np.isfinite(measured_q), self.qpos, np.nan)
+        )
         self.velocity = np.concatenate([r.qvel for r in recordings])
         self._blocks(starts)
         self.floor = self._floors(recordings)
@@ -86,7 +88,9 @@ class Smoother:
         self.live = np.array([np.arange(a, a + length) < b for a, b in blocks]).T
         self.last = np.zeros(starts[-1], bool)
         self.last[starts[1:] - 1] = True  # of a recording: nothing follows
-        self.before = np.cumsum(~self.last) - 1  # row -> its place among the rows that have a next one
+        self.before = (
+            np.cumsum(~self.last) - 1
+        )  # row -> its place among the rows that have a next one
 
     def _floors(self, recordings):
         position, velocity = measurement_noise(self.model, recordings)
@@ -210,8 +214,6 @@ class Smoother:
         """Move every variance to where its score is nearer to zero."""
         nv = self.model.nv
         ratio = lambda pair: np.clip(pair[0] / np.maximum(pair[1], 1e-300), 1 / MOST, MOST)
-        self.walk = np.maximum(
-            self.walk * ratio(found.process)[2 * nv :], 1e-12 * self.scale**2
-        )
+        self.walk = np.maximum(self.walk * ratio(found.process)[2 * nv :], 1e-12 * self.scale**2)
         known = found.measurement[1] > 0
         self.R = np.where(known, np.maximum(self.R * ratio(found.measurement), self.floor), self.R)

@@ -5,8 +5,6 @@ for setting in Beam(columns, evidence).sets(): ...
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from diagnosis.selection.criterion import Score
 from diagnosis.selection.judge import moved_setting, problem
 
@@ -38,7 +36,10 @@ class Beam:
         given = problem(self.columns, options)
         score = self.evidence.score(*given)
         setting = moved_setting(self.columns, score.amounts, options)
-        cost, penalty = 0.0, {o.candidate: o.prior for o in map(self.columns.options.__getitem__, options)}
+        cost, penalty = (
+            0.0,
+            {o.candidate: o.prior for o in map(self.columns.options.__getitem__, options)},
+        )
         for candidate, prior in penalty.items():
             cost += prior.cost(setting[candidate])
         return Node(tuple(options), score, score.loss + cost / self.evidence.number)

@@ -56,6 +56,12 @@ class Option:
         return precision, pull
 
 
+def stepwise(world, candidate):
+    """Whether a candidate has to be worked out before each step, which is dear."""
+    effect = candidate.effect
+    return effect.stepwise(world.model, effect.id(world.model, candidate.place.name))
+
+
 class Columns:
     """Simulates the columns of candidates about a setting. residual (W, T, nv); array (W, T, nv, K); options."""
 
@@ -92,7 +98,16 @@ class Columns:
             out, whole = [], list(world.probes(candidate, recordings))
         together = candidate.effect.together
         if together == 1:
-            whole = [whole[i] for i in np.unique(np.linspace(0, len(whole) - 1, min(len(whole), PROBES)).astype(int))] if whole else []
+            whole = (
+                [
+                    whole[i]
+                    for i in np.unique(
+                        np.linspace(0, len(whole) - 1, min(len(whole), PROBES)).astype(int)
+                    )
+                ]
+                if whole
+                else []
+            )
         for k in range(0, len(whole), together):
             rows = np.array(whole[k : k + together], float)
             start = np.where(np.isfinite(base), base, 0.0)
@@ -128,7 +143,7 @@ class Columns:
 
     def _simulate(self, starts):
         """Simulate starts; those that change nothing are left out."""
-        starts = sorted(starts, key=lambda start: start[0].effect.overrides("force"))
+        starts = sorted(starts, key=lambda start: stepwise(self.world, start[0]))
         jobs = [(s, row) for s, start in enumerate(starts) for row in start[2]]
         changes = []
         for k in range(0, len(jobs), TOGETHER):
@@ -154,7 +169,9 @@ class Columns:
             self.parts += [c for c, yes in zip(own, seen) if yes]
             candidate, base, directions, low, high, prior, merges = start
             self.options.append(
-                Option(candidate, base, directions[seen], columns, low[seen], high[seen], prior, merges)
+                Option(
+                    candidate, base, directions[seen], columns, low[seen], high[seen], prior, merges
+                )
             )
 
     def _remember(self, start, shows):
@@ -192,5 +209,7 @@ class Columns:
                 ends = np.stack([o.prior.low - o.base, o.prior.high - o.base]) / row
             ends = ends[:, np.isfinite(ends).all(0) & (row != 0)]
             low, high = max(ends.min(0).max(initial=-9), -0.5), min(ends.max(0).min(initial=9), 4.0)
-            starts.append((o.candidate, o.base, row[None], np.array([low]), np.array([high]), o.prior, False))
+            starts.append(
+                (o.candidate, o.base, row[None], np.array([low]), np.array([high]), o.prior, False)
+            )
         self._simulate(starts)

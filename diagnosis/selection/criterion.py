@@ -80,7 +80,10 @@ class Evidence:
         square = self.gram[:, :, 0, 0] / np.maximum(self.count, 1)
         self.floor = reference
         if reference is None:
-            middle = [np.median(s[c > 0]) if (c > 0).any() else 0.0 for s, c in zip(square.T, self.count.T)]
+            middle = [
+                np.median(s[c > 0]) if (c > 0).any() else 0.0
+                for s, c in zip(square.T, self.count.T)
+            ]
             self.floor = np.tile(least + SHARE**2 * np.array(middle) + 1e-30, (groups, 1))
         self.number = max(self.cells.sum() * groups / max(self.channels, 1), 1)  # cells per channel
 
@@ -114,17 +117,12 @@ class Evidence:
             weight = self._weight(index, amounts)
             each = np.einsum("gc,gcij->gij", weight, g)
             whole = each.sum(0)
-            amounts = bounded(
-                whole[1:, 1:] + np.diag(precision), whole[1:, 0] + pull, low, high
-            )
+            amounts = bounded(whole[1:, 1:] + np.diag(precision), whole[1:, 0] + pull, low, high)
         weight = self._weight(index, amounts)
         each = np.einsum("gc,gcij->gij", weight, g)
         rest = each.sum(0) - each
         left = np.array(
-            [
-                bounded(r[1:, 1:] + np.diag(precision), r[1:, 0] + pull, low, high)
-                for r in rest
-            ]
+            [bounded(r[1:, 1:] + np.diag(precision), r[1:, 0] + pull, low, high) for r in rest]
         )
         groups = self.losses(self._square(index, left))
         return Score(float(groups.mean()), groups, amounts)
@@ -132,7 +130,9 @@ class Evidence:
     def _weight(self, index, amounts):
         """(G, cells): weights of squares at which least squares lowers the sum of logs."""
         square = self._square(index, amounts)
-        return np.where(self.count > 0, 1 / (np.maximum(self.count, 1) * (square + self.floor)), 0.0)
+        return np.where(
+            self.count > 0, 1 / (np.maximum(self.count, 1) * (square + self.floor)), 0.0
+        )
 
     def looks(self, columns, amounts, precision):
         """In-sample gain (K,) in nats of each further column beside some at their amounts: a first look."""
@@ -154,7 +154,11 @@ def _weights(residual, inside):
     square = np.where(inside, residual**2, 0.0).sum((1, 2)) / np.maximum(inside.sum((1, 2)), 1)
     some = square[inside.any((1, 2))]
     usual = np.median(some) if len(some) else 0.0
-    return np.minimum(1.0, GROSS**2 * usual / np.maximum(square, 1e-300)) if usual else np.ones(len(square))
+    return (
+        np.minimum(1.0, GROSS**2 * usual / np.maximum(square, 1e-300))
+        if usual
+        else np.ones(len(square))
+    )
 
 
 def bounded(matrix, vector, low, high):

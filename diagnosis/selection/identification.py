@@ -6,13 +6,10 @@ found.fitted.setting; found.trajectory; found.rivals
 
 from dataclasses import dataclass
 
-import numpy as np
-from scipy import stats
-
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import Beam
-from diagnosis.selection.columns import Columns
+from diagnosis.selection.columns import Columns, stepwise
 from diagnosis.selection.criterion import Evidence, paired
 from diagnosis.selection.judge import Fitted, Judge
 from diagnosis.selection.plausibility import Usual
@@ -21,7 +18,9 @@ from diagnosis.selection.unmodelled_force import dependences
 ROUNDS = 4
 EARNS = 0.1  # nats of log RMS error, summed over channels, that an effect has to remove
 LEVEL = 0.05  # of false additions in all that is looked at
-IDLE = 1.0  # nats that an effect must promise beside those chosen, to be looked at in further rounds
+IDLE = (
+    1.0  # nats that an effect must promise beside those chosen, to be looked at in further rounds
+)
 FINALISTS = 4  # sets that the simulator judges in a round
 
 
@@ -60,7 +59,7 @@ class Identification:
         self.usual = Usual(self.world, self.train, smoother.scale)
         self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
         setting, ranking = {}, []
-        offered = [c for c in self.candidates if not c.effect.overrides("force")]
+        offered = [c for c in self.candidates if not stepwise(self.world, c)]
         for i in range(ROUNDS):
             self.ahead.start(trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(offered)} candidates")
@@ -69,8 +68,12 @@ class Identification:
             if better:
                 setting = fitted.setting
                 trajectory = smoother.locate(setting, trajectory, passes=1)
-            elif len(offered) < len(self.candidates) and dependences(self.world, trajectory, self.train):
-                offered = self.candidates  # those that are dear to simulate, where something is left
+            elif len(offered) < len(self.candidates) and dependences(
+                self.world, trajectory, self.train
+            ):
+                offered = (
+                    self.candidates
+                )  # those that are dear to simulate, where something is left
             else:
                 break
         self.ahead.start(trajectory)
@@ -84,14 +87,18 @@ class Identification:
 
     def _round(self, setting, offered):
         """(Fitted, whether it is better than what there was, first ranking)."""
-        candidates = [c for c in offered if c not in self.idle] + [c for c in setting if c not in offered]
+        candidates = [c for c in offered if c not in self.idle] + [
+            c for c in setting if c not in offered
+        ]
         columns = Columns(self.ahead, setting, self.usual, candidates, seen=self.seen)
         evidence = Evidence(self.ahead, columns.residual, columns.array)
         columns.secants(evidence)
         evidence = Evidence(self.ahead, columns.residual, columns.array, evidence.floor)
         beam = Beam(columns, evidence)
         start, nodes = beam.nodes()
-        self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}")
+        self.log(
+            f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}"
+        )
         judge = Judge(self.ahead, self.usual, evidence.floor)
         judge.seen = self.seen
         now = judge.fit(setting)
@@ -149,7 +156,11 @@ class Identification:
         near = [
             f
             for f in judged
-            if f is not now and (f.loss < best.loss + EARNS or paired(f.score, best.score).gain < paired(f.score, best.score).spread)
+            if f is not now
+            and (
+                f.loss < best.loss + EARNS
+                or paired(f.score, best.score).gain < paired(f.score, best.score).spread
+            )
         ]
         return min(near, key=lambda f: (complexity(f.setting), f.loss))
 
@@ -167,7 +178,9 @@ class Identification:
             ]
             less = min(tries, key=lambda f: f.loss)
             step = paired(less.score, fitted.score)
-            self.log(f"  without: {less.loss:.3f} {said(less.setting)}; {step.gain:.3f} ± {step.spread:.3f}, p {step.p_value:.2g}")
+            self.log(
+                f"  without: {less.loss:.3f} {said(less.setting)}; {step.gain:.3f} ± {step.spread:.3f}, p {step.p_value:.2g}"
+            )
             if self.earned(less, fitted):
                 break
             fitted = less

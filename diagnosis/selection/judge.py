@@ -44,9 +44,7 @@ class Judge:
         """The Fitted values of a set of effects, begun at the values given."""
         setting, residual = {c: self._inside(c, v) for c, v in setting.items()}, None
         for left in range(steps, -1, -1):
-            columns = Columns(
-                self.ahead, setting, self.usual, list(setting), residual, self.seen
-            )
+            columns = Columns(self.ahead, setting, self.usual, list(setting), residual, self.seen)
             self.simulated += columns.simulated
             evidence = Evidence(self.ahead, columns.residual, columns.array, self.reference)
             index, low, high, precision, pull = problem(columns, range(len(columns.options)))

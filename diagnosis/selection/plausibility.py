@@ -36,7 +36,11 @@ TABLE = {
     "stiffness": [("per travel", 0.5, 0.0, 5.0)],
     "nonlinear_stiffness": [("per travel³", 0.5, -5.0, 5.0)],
     "spring_offset": [("force", 0.5, -2.0, 2.0)],
-    "cogging": [("force", 0.2, -1.0, 1.0), ("plain", np.inf, 0.1, np.inf), ("plain", np.inf, -10, 10)],
+    "cogging": [
+        ("force", 0.2, -1.0, 1.0),
+        ("plain", np.inf, 0.1, np.inf),
+        ("plain", np.inf, -10, 10),
+    ],
     "backlash": [("travel", 0.05, 0.0, 0.3)],
     "gain": [("times", 0.25, 0.5, 2.0)],
     "bias": [("strength", 0.3, -1.5, 1.5)],
@@ -58,7 +62,15 @@ TABLE = {
     "link_length": [("times", 0.1, 0.7, 1.4)],
     "load_friction": [("plain", 0.3, 0.0, 0.9)],
 }
-AWAY = "gravity", "ground_height", "bias", "spring_offset", "center_of_mass", "external_force", "wind"
+AWAY = (
+    "gravity",
+    "ground_height",
+    "bias",
+    "spring_offset",
+    "center_of_mass",
+    "external_force",
+    "wind",
+)
 STRENGTH = 0.04  # share by which gravity's strength may differ from the model's
 
 

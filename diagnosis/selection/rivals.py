@@ -10,7 +10,9 @@ from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.identification import EARNS, complexity
 
 ALIKE = 0.7  # cosine of two effects' columns beside the other findings', from which on one may stand for the other
-FURTHER = 2.5  # how much more complex another member of a class may be: three components for one number
+FURTHER = (
+    2.5  # how much more complex another member of a class may be: three components for one number
+)
 MOST = 3  # others that are told, of twice as many that are refitted
 
 
@@ -58,7 +60,9 @@ def _alike(judge, fitted, candidate, pool):
     """
     ahead = judge.ahead
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    columns = Columns(ahead, rest, judge.usual, _near(judge.ahead.world, candidate, pool) + list(rest))
+    columns = Columns(
+        ahead, rest, judge.usual, _near(judge.ahead.world, candidate, pool) + list(rest)
+    )
     judge.simulated += columns.simulated
     gone = columns.residual - fitted.columns.residual
     evidence = Evidence(ahead, gone, columns.array, fitted.evidence.floor)

@@ -57,7 +57,10 @@ class RowMap:
     def _controls(self, recording):
         """(rows - 1, count, nu): what the actuators see in the steps after each row."""
         model, average = self.nominal, runge_kutta(self.nominal)
-        start, out = recording.time[:-1, None], np.zeros((len(recording.time) - 1, self.count, model.nu))
+        start, out = (
+            recording.time[:-1, None],
+            np.zeros((len(recording.time) - 1, self.count, model.nu)),
+        )
         for a in range(model.nactuator):
             u = model.actuator_ctrladr[a]
             for k in range(u, u + model.actuator_ctrlnum[a]):
@@ -93,9 +96,7 @@ class RowMap:
     def _rollout(self, index, qpos, qvel, force):
         m, n = self.model, len(index)
         state = np.concatenate([np.zeros((n, 1)), qpos, qvel, self.activation[index]], 1)
-        control = np.concatenate(
-            [self.control[index], np.repeat(force[:, None], self.count, 1)], 2
-        )
+        control = np.concatenate([self.control[index], np.repeat(force[:, None], self.count, 1)], 2)
         number = threads() or 2
         path, _ = rollout.rollout(
             m,
@@ -120,17 +121,32 @@ class RowMap:
         n, out = len(index), np.zeros((len(index), self.model.nv))
         xfrc = np.zeros((self.model.nbody, 6))
         constant = np.zeros(self.model.nv)
+        time = np.concatenate([r.time[:-1] for r in self.recordings])
         for c, values in self.case.on:
             i = c.effect.id(self.model, c.place.name)
             c.effect.push(constant, xfrc, self.model, i, values)
-            if c.effect.overrides("force"):
-                own = np.tile(np.array(values, float), (n, 1))
-                function = c.effect.force([self.model] * n, i, own)
-                if function is not None:
-                    time = np.concatenate([r.time[:-1] for r in self.recordings])[index]
-                    out += function(qpos, qvel, self.control[index, 0], time)
+            if not c.effect.stepwise(self.model, i):
+                continue
+            own, models = np.tile(np.array(values, float), (n, 1)), [self.model] * n
+            state = qpos, qvel, self.control[index, 0], time[index]
+            function = c.effect.force(models, i, own)
+            if function is not None:
+                out += function(*state)
+            function = c.effect.rubs(models, i, own)
+            if function is not None:
+                out += function(*state, self._bias(qpos, qvel))
         out += constant
         return out + self._pushed(xfrc, qpos) if xfrc.any() else out
+
+    def _bias(self, qpos, qvel):
+        """(n, nv): qfrc_bias at states."""
+        data, out = mujoco.MjData(self.model), np.zeros((len(qpos), self.model.nv))
+        for row, q, v in zip(out, qpos, qvel):
+            data.qpos[:], data.qvel[:] = q, v
+            mujoco.mj_fwdPosition(self.model, data)
+            mujoco.mj_fwdVelocity(self.model, data)
+            row[:] = data.qfrc_bias
+        return out
 
     def _pushed(self, xfrc, qpos):
         """(n, nv): constant forces on bodies as forces in the joints."""
@@ -157,7 +173,11 @@ class RowMap:
         for d in range(nv):
             unit = np.zeros(nv)
             unit[d] = 1.0
-            for block, k, eps in ((A, d, SMALL[0]), (A, nv + d, SMALL[1]), (B, d, SMALL[2] * scale[d])):
+            for block, k, eps in (
+                (A, d, SMALL[0]),
+                (A, nv + d, SMALL[1]),
+                (B, d, SMALL[2] * scale[d]),
+            ):
                 moved = [qpos, qvel, force]
                 which = 2 if block is B else int(k >= nv)
                 moved[which] = (

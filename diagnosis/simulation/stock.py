@@ -21,7 +21,13 @@ def predicted(model, nominal, windows, step=None):
     states and delayed controls run on through each recording. step(model, data): instead of mj_step.
     """
     q, v = addresses(nominal, model)
-    drives = np.array([model.actuator_ctrladr[model.actuator(nominal.actuator(a).name).id] for a in range(nominal.nactuator)], int)
+    drives = np.array(
+        [
+            model.actuator_ctrladr[model.actuator(nominal.actuator(a).name).id]
+            for a in range(nominal.nactuator)
+        ],
+        int,
+    )
     inputs = nominal.actuator_ctrladr[: nominal.nactuator]
     measured = cut.measured(windows)
     out = np.full(measured.shape, np.nan)
