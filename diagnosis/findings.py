@@ -179,7 +179,7 @@ def noise_by_channel(model, position_noise):
 
 def _figure(world, handed: Handed, check, settings):
     """Errors before, after (of the files handed over, in stock MuJoCo) and of a perfect simulator, as diagnosis.json has them."""
-    model, noise = world.model, check.noise
+    model = world.model
     out, channels = {}, {}
     for name, gaps in (
         ("before", check.gaps(handed.nominal)),
