@@ -72,7 +72,7 @@ def assemble(world, train, held_out, outcome):
     }
     return Diagnosis(
         summary,
-        handed.xml,
+        handed.files.xml,
         world,
         settings,
         _ranking(outcome),
@@ -80,7 +80,7 @@ def assemble(world, train, held_out, outcome):
         train,
         held_out,
         located(world, outcome),
-        handed.python,
+        handed.files.python,
     )
 
 
@@ -119,7 +119,7 @@ def _finding(world, candidate, outcome, bounds, figure):
         if curve
         else depends_on(world.model, candidate),
         "when": candidate.when,
-        "written_as": handed.written[candidate],
+        "written_as": handed.files.forms[candidate],
         "also_possible": [
             {"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, v)}
             for c, v in outcome.others.get(candidate, [])
@@ -181,11 +181,8 @@ def _figure(world, handed: Handed, check, settings):
     """Errors before, after (of the files handed over, in stock MuJoCo) and of a perfect simulator, as diagnosis.json has them."""
     model = world.model
     out, channels = {}, {}
-    for name, gaps in (
-        ("before", check.gaps(handed.nominal)),
-        ("after", check.gaps(handed.model, handed.step)),
-    ):
-        out[name], per_channel = check.rms(gaps)
+    for name, files in (("before", handed.nominal), ("after", handed.files)):
+        out[name], per_channel = check.rms(check.gaps(files))
         for channel, value in per_channel.items():
             channels.setdefault(channel, {})[name] = value
     out["floor"], per_channel, check.scatter = prediction_error.floor_error(

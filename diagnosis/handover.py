@@ -1,30 +1,60 @@
 """What is handed over predicts better: every finding is kept only if the written files, in stock MuJoCo, need it.
 
 handed = accepted(world, check, setting)            # Handed; check: a Check on kept-back recordings
-handed.xml, handed.setting
+handed.files.xml, handed.setting
 """
 
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from diagnosis.estimation import prediction_error
 from diagnosis.estimation import windows as cut
 from diagnosis.simulation import stock
+from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predictions, python_parts
+
+
+@dataclass(frozen=True)
+class Files:
+    """What of a setting is written: corrected.xml, corrected.py ("" where MJCF holds all), and forms {Candidate: where}."""
+
+    xml: str
+    python: str
+    forms: dict
+
+    @classmethod
+    def of(cls, world, setting):
+        """The Files of a setting."""
+        xml, forms = world.corrected_xml(setting)
+        parts = python_parts(world.model, setting, forms)
+        joints = [cut.joint_name(world.model, j) for j in range(world.model.njnt)]
+        return cls(xml, corrected_py(parts, joints) if parts else "", forms)
+
+    def predicted(self, nominal, windows):
+        """qpos (W, T, nq) of windows, by stock MuJoCo and the script; NaN where there is none."""
+        if not self.python:
+            return stock.predicted(stock.compiled(self.xml), nominal, windows)
+        out = np.full(cut.measured(windows).shape, np.nan)
+        with tempfile.TemporaryDirectory() as folder:
+            Path(folder, "corrected.xml").write_text(self.xml, encoding="utf-8")
+            script = Path(folder, "corrected.py")
+            script.write_text(self.python, encoding="utf-8")
+            for row, qpos in zip(out, predictions(script, windows, nominal)):
+                row[: len(qpos)] = qpos
+        return out
 
 
 @dataclass(frozen=True)
 class Handed:
-    """setting: what was kept; xml, python: the files' contents; model, step: compiled from them; nominal: the nominal
-    model as MJCF holds it; written {Candidate: form}; without {Candidate: error of the files without it}."""
+    """setting: what was kept; files: its Files; nominal: those of the nominal model; without {Candidate: error of the
+    files without it}."""
 
     setting: dict
-    xml: str
-    python: str
-    model: object
-    step: object
-    nominal: object
-    written: dict
+    files: Files
+    nominal: Files
     without: dict
 
 
@@ -41,9 +71,9 @@ class Check:
         """Smooth the recordings under a setting, for the floor."""
         self.trajectory = self.smoother.locate(setting, passes=2)
 
-    def gaps(self, model, step=None):
-        """Measured less predicted of a stock model, (W, T - 1, nv), and what was measured."""
-        qpos = stock.predicted(model, self.world.model, self.windows, step)
+    def gaps(self, files):
+        """Measured less predicted of Files, (W, T - 1, nv), and what was measured."""
+        qpos = files.predicted(self.world.model, self.windows)
         return cut.gaps(self.world.model, self.windows, qpos)
 
     def rms(self, gaps):
@@ -55,35 +85,31 @@ class Check:
                 channels[name] = float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
         return float(np.sqrt((square / self.noise**2).sum() / max(known.sum(), 1))), channels
 
-    def error(self, model, step=None):
-        """The contract's error of a stock model."""
-        return self.rms(self.gaps(model, step))[0]
-
-
-def written(world, setting):
-    """(xml, python, model, step, forms) of a setting."""
-    xml, forms = world.corrected_xml(setting)
-    return xml, "", stock.compiled(xml), None, forms
+    def error(self, files):
+        """The contract's error of Files; infinite where they do not run."""
+        try:
+            return self.rms(self.gaps(files))[0]
+        except (ScriptError, ValueError, mujoco.FatalError):
+            return np.inf
 
 
 def accepted(world, check, setting, log=lambda what: None):
     """The Handed of what of a setting earns its place on kept-back recordings: together better than the nominal
     model, and each finding better with than without."""
-    nominal = stock.compiled(world.corrected_xml({})[0])
+    nominal = Files.of(world, {})
     before = check.error(nominal)
     while True:
-        xml, python, model, step, forms = written(world, setting)
-        after = check.error(model, step)
-        without = {}
-        for out in setting:
-            rest = {c: v for c, v in setting.items() if c is not out}
-            _, _, other, other_step, _ = written(world, rest)
-            without[out] = check.error(other, other_step)
-        held = [c for c in setting if forms[c] in ("mjcf", "python")]
+        files = Files.of(world, setting)
+        after = check.error(files)
+        without = {
+            out: check.error(Files.of(world, {c: v for c, v in setting.items() if c is not out}))
+            for out in setting
+        }
+        held = [c for c in setting if files.forms[c] in ("mjcf", "python")]
         worst = min(held, key=lambda c: without[c], default=None)
         if worst is None or without[worst] > after and after < before:
-            return Handed(setting, xml, python, model, step, nominal, forms, without)
+            return Handed(setting, files, nominal, without)
         log(
-            f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with, {before:.4g} nominal"
+            f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g}, {before:.4g} nominal"
         )
         setting = {c: v for c, v in setting.items() if c is not worst}

@@ -60,7 +60,18 @@ TABLE = {
     "sensor_delay": [("plain", 0.02, 0.0, 0.1)],
     "external_force": [("weight", 0.3, -1.0, 1.0)],
     "link_length": [("times", 0.1, 0.7, 1.4)],
-    "load_friction": [("plain", 0.3, 0.0, 0.9)],
+    "load_friction": [("plain", 0.3, 0.0, 0.9), ("plain", 0.3, 0.0, 0.9), ("plain", 0.5, 0.0, 1.0)],
+    "friction_map": [
+        ("force", 0.7, 0.0, 3.0),
+        ("plain", 0.5, 0.0, 1.0),
+        ("plain", np.inf, 0.1, np.inf),
+        ("plain", np.inf, -10, 10),
+    ],
+    "servo_stiffness": [("times", 0.25, 0.4, 2.5)],
+    "servo_damping": [("times", 0.4, 0.2, 5.0)],
+    "coupled_friction": [("force", 0.7, 0.0, 3.0)],
+    "coupled_inertia": [("inertia", 0.5, 0.0, 20.0)],
+    "gain_fade": [("plain", 0.05, 0.0, 0.5)],
 }
 AWAY = (
     "gravity",
