@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import Beam
-from diagnosis.selection.columns import Columns, stepwise
+from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, paired
 from diagnosis.selection.judge import Fitted, Judge
 from diagnosis.selection.plausibility import Usual
-from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
 EARNS = 0.1  # nats of log RMS error, summed over channels, that an effect has to remove
@@ -59,23 +58,15 @@ class Identification:
         self.usual = Usual(self.world, self.train, smoother.scale)
         self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
         setting, ranking = {}, []
-        offered = [c for c in self.candidates if not stepwise(self.world, c)]
         for i in range(ROUNDS):
             self.ahead.start(trajectory)
-            self.say(0.1 + 0.15 * i, f"searching {len(offered)} candidates")
-            fitted, better, look = self._round(setting, offered)
+            self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
+            fitted, better, look = self._round(setting)
             ranking = ranking or look
-            if better:
-                setting = fitted.setting
-                trajectory = smoother.locate(setting, trajectory, passes=1)
-            elif len(offered) < len(self.candidates) and dependences(
-                self.world, trajectory, self.train
-            ):
-                offered = (
-                    self.candidates
-                )  # those that are dear to simulate, where something is left
-            else:
+            if not better:
                 break
+            setting = fitted.setting
+            trajectory = smoother.locate(setting, trajectory, passes=1)
         self.ahead.start(trajectory)
         judge = Judge(self.ahead, self.usual)
         judge.seen = self.seen
@@ -85,11 +76,9 @@ class Identification:
             fitted, bare, trajectory, first, smoother, self.ahead, self.usual, judge, ranking
         )
 
-    def _round(self, setting, offered):
+    def _round(self, setting):
         """(Fitted, whether it is better than what there was, first ranking)."""
-        candidates = [c for c in offered if c not in self.idle] + [
-            c for c in setting if c not in offered
-        ]
+        candidates = [c for c in self.candidates if c not in self.idle]
         columns = Columns(self.ahead, setting, self.usual, candidates, seen=self.seen)
         evidence = Evidence(self.ahead, columns.residual, columns.array)
         columns.secants(evidence)
@@ -150,6 +139,7 @@ class Identification:
 
     def _choose(self, judged, now, number):
         """The simplest set that is as good as the best, if that earns its place over what there was."""
+        judged = [f for f in judged if f is now or f.settled]
         best = min(judged, key=lambda f: f.loss)
         if best is now or not self.earned(now, best, number):
             return now

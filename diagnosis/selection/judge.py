@@ -11,7 +11,7 @@ import numpy as np
 
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, Score
-from diagnosis.selection.plausibility import plausible, possible
+from diagnosis.selection.plausibility import at_limit, plausible, possible
 
 STEPS = 6  # Gauss-Newton steps of a refit, at most
 DONE = 2e-3  # loss that another step would still remove, from which on a refit is done
@@ -31,6 +31,12 @@ class Fitted:
     @property
     def loss(self):
         return self.score.loss
+
+    @property
+    def settled(self):
+        """Whether no value lies at a bound of what is plausible."""
+        options = self.columns.options
+        return not any(at_limit(o.candidate, self.setting[o.candidate], o.prior) for o in options)
 
 
 class Judge:
@@ -67,7 +73,7 @@ class Judge:
         share = 1.0
         for _ in range(HALVINGS):
             moved = moved_setting(columns, share * amounts)
-            if all(possible(c, v, plausible(c, self.usual)) for c, v in moved.items()):
+            if np.isfinite(self.cost(moved)):
                 residual = self.ahead.residual([moved])[0]
                 self.simulated += 1
                 if self._whole(residual, moved, evidence) < inside - DONE:
@@ -81,8 +87,12 @@ class Judge:
         return plain.score((), *[np.zeros(0)] * 4).loss + self.cost(setting) / evidence.number
 
     def cost(self, setting):
-        """Minus the log prior density of a setting's values, nats."""
-        return sum(plausible(c, self.usual).cost(v) for c, v in setting.items())
+        """Minus the log prior density of a setting's values, nats; infinite where they are not possible."""
+        total = 0.0
+        for c, v in setting.items():
+            prior = plausible(c, self.usual)
+            total += prior.cost(v) if possible(c, v, prior) else np.inf
+        return total
 
     def _inside(self, candidate, values):
         prior = plausible(candidate, self.usual)

@@ -58,7 +58,7 @@ TABLE = {
     "sensor_bias": [("plain", 0.05, -0.5, 0.5)],
     "sensor_scale": [("times", 0.05, 0.8, 1.25)],
     "sensor_delay": [("plain", 0.02, 0.0, 0.1)],
-    "external_force": [("weight", 0.3, -1.0, 1.0)],
+    "external_force": [("weight", 0.1, -0.5, 0.5)],
     "link_length": [("times", 0.1, 0.7, 1.4)],
     "load_friction": [("plain", 0.3, 0.0, 0.9), ("plain", 0.3, 0.0, 0.9), ("plain", 0.5, 0.0, 1.0)],
     "friction_map": [
@@ -180,6 +180,14 @@ def plausible(candidate, usual):
         if np.isfinite(nominal[k]):
             low[k], high[k] = min(low[k], nominal[k]), max(high[k], nominal[k])
     return Prior(np.where(np.isfinite(nominal), nominal, 0.0), scale, low, high)
+
+
+def at_limit(candidate, values, prior):
+    """Whether a value lies at a bound of what is plausible: then the truth may lie anywhere beyond."""
+    values = np.asarray(values, float)
+    room = 1e-3 * np.minimum(abs(values) + prior.scale, 1e12)
+    ends = (values <= prior.low + room) | (values >= prior.high - room)
+    return bool((ends & (abs(values - prior.centre) > room)).any())
 
 
 def possible(candidate, values, prior):
