@@ -11,7 +11,7 @@ from diagnosis.estimation import windows as cut
 
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
 FEWEST = 16  # windows that there should be, if shorter ones make up for it
-MOST = 48  # windows that are simulated, evenly chosen of more
+MOST = 32  # windows that are simulated, evenly chosen of more
 GROUPS = 16  # of neighbouring windows, the units that are left out and compared
 
 

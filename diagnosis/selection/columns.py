@@ -178,7 +178,7 @@ class Columns:
         """Keep which parameters of a candidate show at all, so that later columns leave out the others."""
         candidate, base, directions = start[:3]
         single = (directions != 0).sum(1) == 1
-        if single.all() and candidate not in self.seen and len(base) > 1 and shows.any():
+        if single.all() and candidate not in self.seen and len(directions) > 1 and shows.any():
             self.seen[candidate] = (directions[shows] != 0).any(0)
 
     def _shows(self, change):

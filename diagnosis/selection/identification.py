@@ -190,10 +190,7 @@ class Identification:
 
 def complexity(setting):
     """Parameters of a set, and how far its effects are from the first things to think of."""
-    return sum(
-        sum(v != n for v, n in zip(values, c.nominal)) + 0.5 * c.effect.simplicity
-        for c, values in setting.items()
-    )
+    return sum(len(c.parameters) + 0.5 * c.effect.simplicity for c in setting)
 
 
 def said(setting):

@@ -10,10 +10,11 @@ from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.identification import EARNS, complexity
 
 ALIKE = 0.7  # cosine of two effects' columns beside the other findings', from which on one may stand for the other
+SAME = 0.03  # loss by which the simplest member of a class may be worse than the one found
 FURTHER = (
     2.5  # how much more complex another member of a class may be: three components for one number
 )
-MOST = 3  # others that are told, of twice as many that are refitted
+REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
 def classes(candidates, judge, fitted, log=lambda what: None):
@@ -24,7 +25,7 @@ def classes(candidates, judge, fitted, log=lambda what: None):
             continue
         members = _members(candidates, judge, fitted, candidate)
         simplest = min(
-            [fitted, *(f for f, _ in members)],
+            [fitted, *(f for f, _ in members if f.loss < fitted.loss + SAME)],
             key=lambda f: (complexity(f.setting), f is not fitted, f.loss),
         )
         if simplest is not fitted and complexity(simplest.setting) < complexity(fitted.setting):
@@ -46,9 +47,9 @@ def _members(candidates, judge, fitted, candidate):
     pool = [c for c in candidates if c not in fitted.setting and c.effect.name != "time_step"]
     near = _alike(judge, fitted, candidate, pool)
     out = []
-    for other, values in near[: 2 * MOST]:
-        tried = judge.fit({**rest, other: values}, steps=3)
-        if tried.loss < fitted.loss + EARNS:
+    for other, values in near[:REFITS]:
+        tried = judge.fit({**rest, other: values}, steps=2)
+        if tried.settled and tried.loss < fitted.loss + EARNS:
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
