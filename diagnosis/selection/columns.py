@@ -9,14 +9,20 @@ proportion, one for a whole start of values where it does not (a dead zone, a de
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
+from diagnosis.estimation import windows as cut
 from diagnosis.selection.plausibility import plausible
 
 TOGETHER = 40  # settings that are simulated in one call
 FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column stands for it
 PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
+STATES, PROMISING = (
+    300,
+    3,
+)  # of the motion, to compare forces at; groups of starts that are simulated
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
 
 
@@ -62,13 +68,28 @@ def stepwise(world, candidate):
     return effect.stepwise(world.model, effect.id(world.model, candidate.place.name))
 
 
+def applied(model, qpos, qvel, working):
+    """Generalized forces of actuators and joints (n, nv) at states (n, nq), (n, nv) of the nominal coordinates."""
+    data, out = mujoco.MjData(model), np.empty((len(qpos), qvel.shape[1]))
+    for row, q, v in zip(out, qpos, qvel):
+        data.qpos[working.q], data.qvel[working.v] = q, v
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_fwdActuation(model, data)
+        row[:] = (data.qfrc_actuator + data.qfrc_passive)[working.v]
+    return out
+
+
 class Columns:
     """Simulates the columns of candidates about a setting. residual (W, T, nv); array (W, T, nv, K); options."""
 
-    def __init__(self, ahead, setting, usual, candidates, residual=None, seen=None):
+    def __init__(
+        self, ahead, setting, usual, candidates, residual=None, seen=None, trajectory=None
+    ):
         """residual: of the setting, if it is known; seen: {candidate: which of its parameters show}, of earlier looks."""
         self.ahead, self.setting, self.usual, self.world = ahead, setting, usual, ahead.world
         self.options, self.simulated = [], int(residual is None)
+        self.trajectory = trajectory
         self.seen = {} if seen is None else seen
         self.residual = ahead.residual([setting])[0] if residual is None else residual
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
@@ -108,6 +129,8 @@ class Columns:
                 if whole
                 else []
             )
+        if together > 1 and self.trajectory is not None:
+            whole = self._promising(candidate, whole)
         for k in range(0, len(whole), together):
             rows = np.array(whole[k : k + together], float)
             start = np.where(np.isfinite(base), base, 0.0)
@@ -121,6 +144,30 @@ class Columns:
             if all(prior.inside(row) for row in rows):
                 out.append((candidate, start, directions, low, high, prior, together > 1))
         return out
+
+    def _promising(self, candidate, whole):
+        """Of starts that come in groups, those of the groups whose force is most like the located one."""
+        t, world = self.trajectory, self.world
+        rows = np.flatnonzero(~t.free)
+        rows = rows[cut.evenly(len(rows), STATES)]
+        if not len(rows):
+            return whole
+        engine = world.engine(frozenset([candidate])).working
+        forces = []
+        for values in whole:
+            model = engine.edited([(candidate, tuple(values))], world.model.opt.timestep)
+            forces.append(applied(model, t.qpos[rows], t.qvel[rows], engine))
+        zero = list(whole[0])
+        zero[0] = 0.0
+        model = engine.edited([(candidate, tuple(zero))], world.model.opt.timestep)
+        none = applied(model, t.qpos[rows], t.qvel[rows], engine)
+        target, together, left = t.force[rows].ravel(), candidate.effect.together, []
+        for k in range(0, len(whole), together):
+            basis = np.stack([(f - none).ravel() for f in forces[k : k + together]], 1)
+            fit = np.linalg.lstsq(basis, target, rcond=None)[0]
+            left.append(np.sum((target - basis @ fit) ** 2))
+        best = sorted(np.argsort(left)[:PROMISING])
+        return [whole[k * together + i] for k in best for i in range(together)]
 
     @staticmethod
     def _ladder(base, prior):

@@ -57,9 +57,12 @@ class Identification:
         first = trajectory = smoother.locate({})
         self.usual = Usual(self.world, self.train, smoother.scale)
         self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
+        self.screen = self.ahead.sparse()
         setting, ranking = {}, []
         for i in range(ROUNDS):
             self.ahead.start(trajectory)
+            self.screen.start(trajectory)
+            self.trajectory = trajectory
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
             fitted, better, look = self._round(setting)
             ranking = ranking or look
@@ -79,18 +82,21 @@ class Identification:
     def _round(self, setting):
         """(Fitted, whether it is better than what there was, first ranking)."""
         candidates = [c for c in self.candidates if c not in self.idle]
-        columns = Columns(self.ahead, setting, self.usual, candidates, seen=self.seen)
-        evidence = Evidence(self.ahead, columns.residual, columns.array)
+        columns = Columns(
+            self.screen, setting, self.usual, candidates, seen=self.seen, trajectory=self.trajectory
+        )
+        evidence = Evidence(self.screen, columns.residual, columns.array)
         columns.secants(evidence)
-        evidence = Evidence(self.ahead, columns.residual, columns.array, evidence.floor)
+        evidence = Evidence(self.screen, columns.residual, columns.array, evidence.floor)
         beam = Beam(columns, evidence)
         start, nodes = beam.nodes()
         self.log(
             f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}"
         )
-        judge = Judge(self.ahead, self.usual, evidence.floor)
+        judge = Judge(self.ahead, self.usual)
         judge.seen = self.seen
         now = judge.fit(setting)
+        judge.reference = now.evidence.floor
         judged = [now]
         for node in self._finalists(beam, start, nodes):
             fitted = judge.fit(beam.setting(node), steps=3)

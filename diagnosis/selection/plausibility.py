@@ -6,6 +6,7 @@ prior = plausible(candidate, usual)                # centre, scale, low, high of
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from diagnosis.effects.actuators import ActuatorEffect
@@ -125,7 +126,9 @@ class Usual:
     def dof(self, place):
         """The dof of a joint's place, or of the joint an actuator acts on; None elsewhere."""
         if place.kind == "joint":
-            return self.model.jnt_dofadr[self.model.joint(place.name).id]
+            first = place.name.split("+")[0]  # of two that an effect couples
+            known = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, place.name) >= 0
+            return self.model.jnt_dofadr[self.model.joint(place.name if known else first).id]
         if place.kind == "actuator":
             i = self.model.actuator(place.name).id
             if ActuatorEffect.on_joint(self.model, i):
