@@ -1,7 +1,7 @@
 """The model's own sensors beside the joints': what was recorded of them against what MuJoCo computes from the predicted state.
 
-    errors(world, settings, held_out)                                          # {sensor: before, after, noise, unit}
-    faults(world, settings, train, position_noise, velocity_noise)             # findings: a bias, scale or delay of one
+    errors(world, settings, held_out)                       # {sensor: before, after, noise, unit}
+    faults(world, settings, train, trajectory)              # findings: a bias, scale or delay of one
 
 Nothing is fitted to them but their own faults, and those only where one explains nearly all that the corrected model leaves,
 of sensors of motion: forces are the model's own, and where they differ it may be the model that is wrong.
@@ -13,14 +13,18 @@ import mujoco
 import numpy as np
 
 from diagnosis.effects.base import SLIDE
-from diagnosis.estimation import cluster_scores, initial_states, prediction_error, residuals
+from diagnosis.estimation import groups, prediction_error
 from diagnosis.estimation import windows as cut
+from diagnosis.estimation.noise import difference_noise
 from diagnosis.selection import transients
 
 LEVEL = 1e-3  # false-alarm rate, shared between all sensors and faults
 EXPLAINED = 0.8  # of what lies above a sensor's noise, the share that its fault must explain
 LATE = 0.1  # s, of a window, before which a late sensor would read what was before it
+MOST = 100  # windows that are simulated, evenly chosen of more
+TURNS = 4  # Gauss-Newton steps of a fault
 SAME = 0.05  # errors closer than this cannot be told apart
+FAULTS = "sensor_bias", "sensor_scale", "sensor_delay"
 MOTION = "rad", "rad/s", "rad/s²", "m", "m/s", "m/s²"
 UNITS = {
     "rad": "JOINTPOS",
@@ -37,7 +41,7 @@ UNITS = {
 
 
 class Tried(NamedTuple):
-    """A sensor's fault at a value, and sums over each of the clusters of windows (C,)."""
+    """A sensor's fault at a value, and sums over each group of windows (G,)."""
 
     candidate: object
     value: float
@@ -95,7 +99,7 @@ def noise_of(recordings, name):
     return float(
         np.median(
             [
-                cut.difference_noise(column)
+                difference_noise(r.time, column)
                 for r in recordings
                 if name in r.sensors
                 for column in r.sensors[name].T
@@ -142,118 +146,98 @@ def errors(world, settings, recordings):
     return out
 
 
-def faults(world, settings, train, position_noise, velocity_noise, event=None, most=100):
+def faults(world, settings, train, trajectory, event=None):
     """[finding] for every sensor of which a bias, a scale or a delay explains nearly all that the corrected model leaves.
 
-    event: of the recordings, in whose time nothing is looked for, or None."""
-    known, out = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION], []
+    trajectory: a smoother.Trajectory of the recordings `train` under the settings, for start states.
+    event: of the recordings, in whose time nothing is looked for, or None.
+    """
+    known = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION]
     if not known:
-        return out
+        return []
     windows = [
         w
         for r in train
         for first, end in transients.quiet(r, event)
         for w in cut.consecutive(r, cut.HORIZON, first, end)
     ]
-    windows = windows[:: -(-len(windows) // most)]
-    fit = initial_states.fit(
-        residuals.Problem(world, windows, position_noise, velocity_noise),
-        residuals.Hypothesis(tuple(settings.items())),
-        sharp=False,
+    tried = _tried(
+        world, settings, known, [windows[i] for i in cut.evenly(len(windows), MOST)], trajectory
     )
-    labels, early = (
-        cluster_scores.clusters(windows),
-        np.zeros(measured(windows, "", 1).shape[:2], bool),
-    )
-    for i, w in enumerate(windows):
-        early[
-            i, : np.searchsorted(w.recording.time, w.recording.time[w.first] + LATE) - w.first
-        ] = True
+    out = []
+    for name, _ in known:
+        mine = sorted((t for (n, _), t in tried.items() if n == name), key=lambda t: t.left.sum())
+        found = [finding(world.model, t, noise_of(train, name), len(tried)) for t in mine]
+        if not found[0]:
+            continue
+        bound = (1 + SAME) ** 2 * mine[0].left.sum()
+        same = [f for f, t in zip(found[1:], mine[1:]) if f and t.left.sum() < bound]
+        out.append({**found[0], "also_possible": [_told(f) for f in same]})
+    return out
+
+
+def _told(finding):
+    """A finding as it stands in another one's also_possible."""
+    keys = "name", "nominal", "value", "unit"
+    parameters = [{k: p[k] for k in keys} for p in finding["parameters"]]
+    return {"effect": finding["effect"], "place": finding["place"], "parameters": parameters}
+
+
+def _tried(world, settings, known, windows, trajectory):
+    """{(sensor, effect): Tried}, each fault fitted on its own; those of all sensors at once, for none acts on another."""
+    begun = trajectory.at(windows)
     predict = lambda more: world.simulate(
-        [{**settings, **more}] * len(windows), fit.qpos, fit.qvel, windows, sensors=True
+        [{**settings, **more}] * len(windows), *begun, windows, sensors=True
     )[2]
-    plain, tried = predict({}), {}
-    for effect in (
-        "sensor_bias",
-        "sensor_scale",
-        "sensor_delay",
-    ):  # of all sensors at once: none acts on another
-        candidates = {
-            c.place.name: c
-            for c in world.candidates
-            if c.effect.name == effect and c.place.kind == "sensor"
-        }
-        values = {name: candidates[name].nominal[0] for name, _ in known}
-        for _ in range(4):
-            now = predict({candidates[n]: (v,) for n, v in values.items()})
-            moved = predict(
-                {candidates[n]: (v + candidates[n].parameters[0].step,) for n, v in values.items()}
-            )
+    late, plain, tried = _late(windows), predict({}), {}
+    group = groups.neighbours(len(windows))
+    for effect in FAULTS:
+        candidates = {name: world.candidate(effect, name) for name, _ in known}
+        values = {name: c.nominal[0] for name, c in candidates.items()}
+        for _ in range(TURNS):
+            steps = {name: c.parameters[0].step for name, c in candidates.items()}
+            now = predict({c: (values[n],) for n, c in candidates.items()})
+            moved = predict({c: (values[n] + steps[n],) for n, c in candidates.items()})
             for name, columns in known:
-                p, target = (
-                    candidates[name].parameters[0],
-                    measured(windows, name, columns.stop - columns.start),
-                )
-                slope = (moved[..., columns] - now[..., columns]) / p.step
+                target = measured(windows, name, columns.stop - columns.start)
+                slope = (moved[..., columns] - now[..., columns]) / steps[name]
                 left, bare = target - now[..., columns], target - plain[..., columns]
-                here = (
-                    np.isfinite(left) & np.isfinite(slope) & np.isfinite(bare) & ~early[..., None]
-                )
-                total = lambda x: cluster_scores.summed(labels, np.where(here, x, 0.0).sum((1, 2)))
-                gram, score = total(slope**2), total(slope * left)
-                tried[name, effect] = Tried(
+                here = np.isfinite(left + slope + bare) & late[..., None]
+                total = lambda x: groups.summed(group, np.where(here, x, 0.0).sum((1, 2)))
+                one = Tried(
                     candidates[name],
                     values[name],
-                    gram,
-                    score,
+                    total(slope**2),
+                    total(slope * left),
                     total(left**2),
                     total(bare**2),
                     here.sum(),
                 )
-                values[name] = float(
-                    np.clip(values[name] + score.sum() / max(gram.sum(), 1e-300), p.low, p.high)
-                )
-    for name, columns in known:
-        mine = sorted((t for (n, _), t in tried.items() if n == name), key=lambda t: t.left.sum())
-        found = [finding(world.model, t, noise_of(train, name), len(tried)) for t in mine]
-        if found[0]:
-            same = [
-                f
-                for f, t in zip(found[1:], mine[1:])
-                if f and t.left.sum() < (1 + SAME) ** 2 * mine[0].left.sum()
-            ]
-            rivals = [
-                {
-                    "effect": f["effect"],
-                    "place": f["place"],
-                    "parameters": [
-                        {k: p[k] for k in ("name", "nominal", "value", "unit")}
-                        for p in f["parameters"]
-                    ],
-                }
-                for f in same
-            ]
-            out.append({**found[0], "also_possible": rivals})
+                tried[name, effect], p = one, candidates[name].parameters[0]
+                step = one.score.sum() / max(one.gram.sum(), 1e-300)
+                values[name] = float(np.clip(values[name] + step, p.low, p.high))
+    return tried
+
+
+def _late(windows):
+    """(W, T): rows so long after their window's beginning that even a late sensor reads what is in it."""
+    out = np.ones(measured(windows, "", 1).shape[:2], bool)
+    for row, w in zip(out, windows):
+        time = w.recording.time
+        row[: np.searchsorted(time, time[w.first] + LATE) - w.first] = False
     return out
 
 
 def finding(model, tried, noise, tests):
     """The finding of a sensor's fault, or None where it is not sure enough. tests: how many faults were tried in all."""
-    name, p, gram = tried.candidate.place.name, tried.candidate.parameters[0], tried.gram
+    name, p = tried.candidate.place.name, tried.candidate.parameters[0]
     left, bare = tried.left.sum(), tried.bare.sum()
-    if len(gram) < 3 or not bare - left > EXPLAINED * max(bare - tried.rows * noise**2, 0.2 * bare):
+    if not bare - left > EXPLAINED * max(bare - tried.rows * noise**2, 0.2 * bare):
         return None
-    whole = tried.score + gram * (
-        tried.value - p.nominal
-    )  # as seen from the sound sensor, its slope taken as here
-    move, _, chance, held = cluster_scores.wald(gram[:, None, None], whole[:, None])
-    if chance * tests > LEVEL or held.sum() <= 0:
-        return None
-    half = cluster_scores.t_quantile(len(gram) - 1) * float(
-        np.sqrt(cluster_scores.sandwich(gram[:, None, None], whole[:, None], move)[0, 0])
-    )
-    low, high = tried.value - half, tried.value + half
-    if low <= p.nominal <= high:
+    # as seen from the sound sensor, its slope taken as here
+    line = groups.fitted(tried.gram, tried.score + tried.gram * (tried.value - p.nominal))
+    low, high = tried.value - line.half, tried.value + line.half
+    if line.p_value * tests > LEVEL or low <= p.nominal <= high:
         return None
     size = unit(model, name) if p.unit == "sensor" else p.unit
     return {
@@ -272,8 +256,10 @@ def finding(model, tried, noise, tests):
         "evidence": {
             "held_out_error_removed": 0.0,
             "sensor_error_removed": float(1 - np.sqrt(left / bare)),
-            "p_value": min(chance * tests, 1.0),
+            "p_value": min(line.p_value * tests, 1.0),
         },
+        "adequate": True,
+        "strains": None,
         "depends_on": [],
         "when": None,
         "written_as": "measurement",

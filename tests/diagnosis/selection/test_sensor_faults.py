@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from diagnosis.estimation import windows as cut
+from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.selection import sensor_faults
 from diagnosis.simulation.simulator import World
@@ -57,13 +58,8 @@ def world():
 def faults(fault, settings=None, damping=0.05):
     here = world()
     settings = {here.candidate(*c): v for c, v in (settings or {}).items()}
-    return sensor_faults.faults(
-        here,
-        settings,
-        [run(k, damping, fault=fault) for k in range(2)],
-        np.array([5e-4]),
-        np.array([np.inf]),
-    )
+    runs = [run(k, damping, fault=fault) for k in range(2)]
+    return sensor_faults.faults(here, settings, runs, Smoother(here, runs).locate(settings))
 
 
 def test_errors_are_those_of_stock_mujoco():
@@ -96,7 +92,7 @@ def test_errors_are_those_of_stock_mujoco():
 def test_a_sound_sensor_and_a_wrong_model_are_no_faults():
     assert faults(None) == []
     assert faults(None, damping=0.2) == []
-    assert sensor_faults.faults(world(), {}, [replace(run(0), sensors={})], None, None) == []
+    assert sensor_faults.faults(world(), {}, [replace(run(0), sensors={})], None) == []
     assert sensor_faults.errors(world(), {}, [replace(run(0), sensors={})]) == {}
     assert (
         faults(lambda name, x: 1.2 * x if name == "force" else x) == []
