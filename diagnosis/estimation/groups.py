@@ -1,6 +1,6 @@
-"""One number fitted to groups of windows: its value, its 95 % interval, and how likely it is none.
+"""One number fitted to groups of neighbouring windows or rows: its value, its 95 % interval, and how likely it is none.
 
-line = fitted(gram, score)          # sums of slope² and slope · residual over each group's windows
+line = fitted(gram, score)          # sums of slope² and slope · residual over each group
 line.value, line.half, line.p_value
 
 The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees of
@@ -26,12 +26,12 @@ class Line(NamedTuple):
 
 
 def neighbours(number):
-    """Group (number,) of each of so many windows in their order."""
+    """Group (number,) of each of so many windows or rows in their order."""
     return np.arange(number) * min(GROUPS, number) // max(number, 1)
 
 
 def summed(group, x):
-    """Sums over the windows of each group: (W, ...) -> (G, ...)."""
+    """Sums over each group: (n, ...) -> (G, ...)."""
     out = np.zeros((group.max() + 1, *x.shape[1:]))
     np.add.at(out, group, x)
     return out

@@ -3,7 +3,7 @@
     errors(world, settings, held_out)                       # {sensor: before, after, noise, unit}
     faults(world, settings, train, trajectory)              # findings: a bias, scale or delay of one
 
-Nothing is fitted to them but their own faults, and those only where one explains nearly all that the corrected model leaves,
+Nothing is fitted to them but their own faults, and those only where one explains nearly all that is left,
 of sensors of motion: forces are the model's own, and where they differ it may be the model that is wrong.
 """
 
@@ -17,11 +17,11 @@ from diagnosis.estimation import groups, prediction_error
 from diagnosis.estimation import windows as cut
 from diagnosis.estimation.noise import difference_noise
 from diagnosis.selection import transients
+from diagnosis.simulation.rows import RowMap
 
 LEVEL = 1e-3  # false-alarm rate, shared between all sensors and faults
 EXPLAINED = 0.8  # of what lies above a sensor's noise, the share that its fault must explain
-LATE = 0.1  # s, of a window, before which a late sensor would read what was before it
-MOST = 100  # windows that are simulated, evenly chosen of more
+LATE = 0.1  # s, of a recording, before which a late sensor would read what was before it
 TURNS = 4  # Gauss-Newton steps of a fault
 SAME = 0.05  # errors closer than this cannot be told apart
 FAULTS = "sensor_bias", "sensor_scale", "sensor_delay"
@@ -41,7 +41,7 @@ UNITS = {
 
 
 class Tried(NamedTuple):
-    """A sensor's fault at a value, and sums over each group of windows (G,)."""
+    """A sensor's fault at a value, and sums over each group of neighbouring rows (G,)."""
 
     candidate: object
     value: float
@@ -147,24 +147,14 @@ def errors(world, settings, recordings):
 
 
 def faults(world, settings, train, trajectory, event=None):
-    """[finding] for every sensor of which a bias, a scale or a delay explains nearly all that the corrected model leaves.
+    """[finding] for every sensor of which a bias, a scale or a delay explains nearly all that the smoothed motion leaves.
 
-    trajectory: a smoother.Trajectory of the recordings `train` under the settings, for start states.
-    event: of the recordings, in whose time nothing is looked for, or None.
+    trajectory: a smoother.Trajectory of the recordings `train` under the settings: its states are right whatever
+    the model lacks, and so are readings worked out of them. event: of the recordings, in whose time nothing is
+    looked for, or None.
     """
     known = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION]
-    if not known:
-        return []
-    windows = [
-        w
-        for r in train
-        for first, end in transients.quiet(r, event)
-        for w in cut.consecutive(r, cut.HORIZON, first, end)
-    ]
-    tried = _tried(
-        world, settings, known, [windows[i] for i in cut.evenly(len(windows), MOST)], trajectory
-    )
-    out = []
+    tried, out = _tried(world, settings, known, train, trajectory, event) if known else {}, []
     for name, _ in known:
         mine = sorted((t for (n, _), t in tried.items() if n == name), key=lambda t: t.left.sum())
         found = [finding(world.model, t, noise_of(train, name), len(tried)) for t in mine]
@@ -183,49 +173,84 @@ def _told(finding):
     return {"effect": finding["effect"], "place": finding["place"], "parameters": parameters}
 
 
-def _tried(world, settings, known, windows, trajectory):
-    """{(sensor, effect): Tried}, each fault fitted on its own; those of all sensors at once, for none acts on another."""
-    begun = trajectory.at(windows)
-    predict = lambda more: world.simulate(
-        [{**settings, **more}] * len(windows), *begun, windows, sensors=True
-    )[2]
-    late, plain, tried = _late(windows), predict({}), {}
-    group = groups.neighbours(len(windows))
-    for effect in FAULTS:
-        candidates = {name: world.candidate(effect, name) for name, _ in known}
-        values = {name: c.nominal[0] for name, c in candidates.items()}
-        for _ in range(TURNS):
-            steps = {name: c.parameters[0].step for name, c in candidates.items()}
-            now = predict({c: (values[n],) for n, c in candidates.items()})
-            moved = predict({c: (values[n] + steps[n],) for n, c in candidates.items()})
-            for name, columns in known:
-                target = measured(windows, name, columns.stop - columns.start)
-                slope = (moved[..., columns] - now[..., columns]) / steps[name]
-                left, bare = target - now[..., columns], target - plain[..., columns]
-                here = np.isfinite(left + slope + bare) & late[..., None]
-                total = lambda x: groups.summed(group, np.where(here, x, 0.0).sum((1, 2)))
-                one = Tried(
-                    candidates[name],
-                    values[name],
-                    total(slope**2),
-                    total(slope * left),
-                    total(left**2),
-                    total(bare**2),
-                    here.sum(),
+def _tried(world, settings, known, recordings, trajectory, event):
+    """{(sensor, effect): Tried}, each fault fitted on its own."""
+    shown, out = readings(world, settings, recordings, trajectory), {}
+    rows = [
+        np.concatenate([np.arange(a, b) for a, b in transients.quiet(r, event)] or [[]]).astype(int)
+        for r in recordings
+    ]
+    rows = [
+        i[(r.time[i] >= r.time[0] + LATE) & (i < len(r.time) - 1)] for i, r in zip(rows, recordings)
+    ]
+    group = groups.neighbours(sum(map(len, rows)))
+    for name, columns in known:
+        width = columns.stop - columns.start
+        target = np.concatenate(
+            [
+                r.sensors.get(name, np.full((len(r.time), width), np.nan))[i]
+                for r, i in zip(recordings, rows)
+            ]
+        )
+
+        def predict(measure):
+            offset, ratio, delay = measure
+            late = [
+                np.stack(
+                    [np.interp(r.time[i] - delay, r.time, x) for x in sensors[:, columns].T], 1
                 )
-                tried[name, effect], p = one, candidates[name].parameters[0]
-                step = one.score.sum() / max(one.gram.sum(), 1e-300)
-                values[name] = float(np.clip(values[name] + step, p.low, p.high))
-    return tried
+                for r, i, sensors in zip(recordings, rows, shown)
+            ]
+            return ratio * np.concatenate(late) + offset
 
-
-def _late(windows):
-    """(W, T): rows so long after their window's beginning that even a late sensor reads what is in it."""
-    out = np.ones(measured(windows, "", 1).shape[:2], bool)
-    for row, w in zip(out, windows):
-        time = w.recording.time
-        row[: np.searchsorted(time, time[w.first] + LATE) - w.first] = False
+        for effect in FAULTS:
+            out[name, effect] = _fitted(world.candidate(effect, name), predict, target, group)
     return out
+
+
+def _fitted(candidate, predict, target, group):
+    """The Tried of a fault at the value that suits it. predict(measure): readings (n, k); target (n, k); group (n,)."""
+    p, measure = candidate.parameters[0], candidate.effect.measure
+    value, total = p.nominal, lambda x: groups.summed(group, np.where(here, x, 0.0).sum(1))
+    for _ in range(TURNS):
+        now = predict(measure((value,)))
+        slope, left = (predict(measure((value + p.step,))) - now) / p.step, target - now
+        here = np.isfinite(left + slope)
+        gram, score = total(slope**2), total(slope * left)
+        best, value = (
+            value,
+            float(np.clip(value + score.sum() / max(gram.sum(), 1e-300), p.low, p.high)),
+        )
+    bare = target - predict(measure((p.nominal,)))
+    return Tried(candidate, best, gram, score, total(left**2), total(bare**2), here.sum())
+
+
+def readings(world, settings, recordings, trajectory):
+    """[(T, nsensordata)] of each recording: what sound sensors show along a smoothed motion, under its located force.
+
+    The last row's control belongs to what follows; it is repeated from the row before.
+    """
+    rows = RowMap(world, recordings, settings)
+    qpos, qvel, force = (
+        x[rows.begin] for x in (trajectory.qpos, trajectory.qvel, trajectory.force)
+    )
+    for c, values in rows.case.on:
+        if c.place.kind == "joint" and c.effect.overrides(
+            "measure"
+        ):  # what its encoder shows is not so
+            joint = world.model.joint(c.place.name)
+            offset, ratio, _ = c.effect.measure(values)
+            qpos[:, joint.qposadr[0]] = (qpos[:, joint.qposadr[0]] - offset) / ratio
+            qvel[:, joint.dofadr[0]] /= ratio
+    force = np.nan_to_num(force) + rows.forces(np.arange(len(qpos)), qpos, qvel)
+    data, out = mujoco.MjData(rows.model), np.empty((len(qpos), world.model.nsensordata))
+    for i in range(len(qpos)):
+        data.qpos[:], data.qvel[:], data.act[:] = qpos[i], qvel[i], rows.activation[i]
+        data.ctrl[:], data.qfrc_applied[:] = rows.control[i, 0], force[i]
+        mujoco.mj_forward(rows.model, data)
+        out[i] = data.sensordata[: out.shape[1]]
+    ends = np.cumsum([len(r.time) - 1 for r in recordings])[:-1]
+    return [np.concatenate([part, part[-1:]]) for part in np.split(out, ends)]
 
 
 def finding(model, tried, noise, tests):

@@ -85,7 +85,7 @@ class RowMap:
         """
         n, m = len(index), self.model
         out_q, out_v = np.empty((n, m.nq)), np.empty((n, m.nv))
-        held = force + self._forces(index, qpos, qvel)
+        held = force + self.forces(index, qpos, qvel)
         for a in range(0, n, CHUNK):
             part = slice(a, a + CHUNK)
             out_q[part], out_v[part] = self._rollout(
@@ -116,7 +116,7 @@ class RowMap:
         v0, v1 = (x[:, 1 + m.nq : 1 + m.nq + m.nv] for x in (here, there))
         return integrate(m, q0, f * difference(m, q0, q1)), v0 + f * (v1 - v0)
 
-    def _forces(self, index, qpos, qvel):
+    def forces(self, index, qpos, qvel):
         """(n, nv): forces of the setting's effects that depend on the state, as at the row's beginning."""
         n, out = len(index), np.zeros((len(index), self.model.nv))
         xfrc = np.zeros((self.model.nbody, 6))
