@@ -1,0 +1,228 @@
+"""An event, an effect that acts only for a while, placed in time and fitted on the windows around it.
+
+local = Local(scene, trajectory, chi2, a, b)         # windows a..b of a Windows
+event = local.event(look, p_value)                   # look: a Look at the effect
+
+Windows begin at smoothed states, which are free to move: what they explain is projected out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from diagnosis.estimation import windows as cut
+
+SPAN = 0.2  # s, of a window
+LONGER = 2.5  # of it, windows in which ends and values are fitted
+SAME = 1.1  # squared residual around an event, up to which another effect may stand in its place
+ALIKE = 0.8  # of the event's gain, what another effect must gain to be looked at
+
+
+@dataclass(frozen=True)
+class Event:
+    """candidate: localised; values; recording; time (from, to), s; low, high: 95 % bounds of the values; p_value:
+    corrected for all that was looked at; removed: share of the error around it; left: squared residual of all
+    windows with it; others [(candidate, values)]: what explains it as well."""
+
+    candidate: object
+    values: tuple
+    recording: object
+    time: tuple
+    p_value: float
+    left: float = np.inf
+    low: tuple = ()
+    high: tuple = ()
+    removed: float = 0.0
+    others: tuple = ()
+
+    @property
+    def when(self):
+        return {"recording": self.recording.name, "time": [float(t) for t in self.time]}
+
+
+class Windows:
+    """Predictions of windows from free start states: residuals in noises, with what start states explain taken out."""
+
+    def __init__(self, world, setting, windows, trajectory, noise):
+        """trajectory: a smoother.Trajectory under the setting; noise (nv,): of the positions."""
+        self.world, self.setting, self.windows = world, setting, windows
+        self.qpos, self.qvel = trajectory.at(windows)
+        self.measured, self.noise = cut.measured(windows), noise
+        self.residual = self._raw([setting])[0]
+        small = np.concatenate([1e-5 * np.ones_like(noise), 1e-4 * np.ones_like(noise)])
+        slopes = [
+            (self._raw([setting], eps * unit)[0] - self.residual) / eps
+            for eps, unit in zip(small, np.eye(len(small)))
+        ]
+        self.known = self.residual != 0
+        # of each window its own basis: orthonormal columns (W, rows, 2 nv)
+        self.basis = np.linalg.qr(np.stack(slopes, -1))[0]
+        self.rows = np.maximum(self.known.sum(1) - self.basis.shape[-1], 1)
+
+    def _raw(self, settings, moved=None):
+        """Measured less predicted in noises, (settings, W, rows); 0 where nothing was measured or predicted."""
+        model, n = self.world.model, len(settings)
+        moved = np.zeros(2 * model.nv) if moved is None else moved
+        qpos = np.tile(
+            cut.integrate(model, self.qpos, np.tile(moved[: model.nv], (len(self.qpos), 1))), (n, 1)
+        )
+        qvel = np.tile(self.qvel + moved[model.nv :], (n, 1))
+        each = [s for s in settings for _ in self.windows]
+        path = self.world.simulate(each, qpos, qvel, self.windows * n)[0]
+        with np.errstate(invalid="ignore", over="ignore"):
+            gap = cut.difference(model, path, np.tile(self.measured, (n, 1, 1))) / self.noise
+        return np.where(np.isfinite(gap), gap, 0.0).reshape(n, len(self.windows), -1)
+
+    def left(self, settings):
+        """What settings leave beside free start states, (settings, W, rows)."""
+        raw = self._raw(settings)
+        return raw - np.einsum(
+            "wrk,swk->swr", self.basis, np.einsum("wrk,swr->swk", self.basis, raw)
+        )
+
+
+@dataclass(frozen=True)
+class Look:
+    """An effect that may come and go: timed, the candidate to report; base, its values where it adds nothing;
+    steps (k,) of the columns that show; which of the parameters (k,); score (W, k), gram (W, k, k)."""
+
+    timed: object
+    base: np.ndarray
+    steps: np.ndarray
+    which: np.ndarray
+    score: np.ndarray
+    gram: np.ndarray
+
+    def values(self, amounts):
+        """All values of the candidate at amounts (k,) of the columns."""
+        out = self.base.copy()
+        out[self.which] += amounts * self.steps
+        low, high = (
+            np.array([getattr(p, end) for p in self.timed.parameters]) for end in ("low", "high")
+        )
+        return tuple(float(v) for v in np.clip(out, low, high))
+
+
+class Local:
+    """The windows around an event's, a..b of a scene, to fit its ends and values in."""
+
+    def __init__(self, scene, trajectory, chi2, a, b):
+        """chi2 (W,): squared residuals of the scene's windows without an event."""
+        owner = [w.recording for w in scene.windows]
+        near = [i for i in range(a - 2, b + 3) if 0 <= i < len(owner) and owner[i] is owner[a]]
+        first, end = scene.windows[near[0]].first, scene.windows[near[-1]].last + 1
+        longer = cut.consecutive(owner[a], LONGER * SPAN, first, end)
+        self.scene, self.chi2, self.inside = scene, chi2, slice(a, b + 1)
+        self.local = Windows(scene.world, scene.setting, longer, trajectory, scene.noise)
+        self.around = float((self.local.left([scene.setting]) ** 2).sum())
+        self.recording, time = owner[a], owner[a].time
+        self.time = [time[scene.windows[a].first], time[scene.windows[b].last]]
+        self.sample = float(np.median(np.diff(time)))
+
+    def _placed(self, look, time):
+        when = {"recording": self.recording.name, "time": [float(t) for t in time]}
+        return self.scene.world.localised(look.timed, when)
+
+    def _fits(self, look, times, values):
+        """[(left, amounts, Gram matrix)] of an event at several times, linear about some values."""
+        settings = []
+        for time in times:
+            candidate = self._placed(look, time)
+            rows = np.tile(values, (1 + len(look.which), 1))
+            rows[1 + np.arange(len(look.which)), look.which] += look.steps
+            settings += [{**self.scene.setting, candidate: tuple(row)} for row in rows]
+        left = self.local.left(settings).reshape(len(times), 1 + len(look.which), -1)
+        out = []
+        for rows in left:
+            columns = (rows[:1] - rows[1:]).T
+            amounts = solved(columns.T @ columns, columns.T @ rows[0])
+            out.append((float(((rows[0] - columns @ amounts) ** 2).sum()), amounts))
+        return out
+
+    def event(self, look, p_value):
+        """The Event with its ends moved and its values fitted, on the windows around it."""
+        inside, which = self.inside, look.which
+        values = look.values(solved(look.gram[inside].sum(0), look.score[inside].sum(0)))
+        ends = list(self.time)
+        move = lambda amounts: look.values(
+            (np.array(values)[which] - look.base[which]) / look.steps + amounts
+        )
+        for reach in SPAN / 3.0 ** np.arange(4):
+            for end in (0, 1):
+                trials = [ends] + [
+                    [t + shift * (i == end) for i, t in enumerate(ends)]
+                    for shift in np.linspace(-reach, reach, 6)
+                ]
+                trials = [t for t in trials if t[1] - t[0] > self.sample]
+                fits = self._fits(look, trials, values)
+                best = int(np.argmin([left for left, _ in fits]))
+                ends, values = trials[best], move(fits[best][1])
+        values = move(self._fits(look, [ends], values)[0][1])
+        left, half = self._spread(look, ends, values)
+        low, high = (tuple(float(v) for v in np.add(values, sign * half)) for sign in (-1, 1))
+        return Event(
+            self._placed(look, ends),
+            values,
+            self.recording,
+            tuple(float(t) for t in ends),
+            p_value,
+            left=float(self.chi2.sum() - self.around + left),
+            low=low,
+            high=high,
+            removed=float(1 - np.sqrt(left / self.around)),
+        )
+
+    def _spread(self, look, ends, values):
+        """(squared residual, half widths (k,) of the values' 95 % intervals, ends being free)."""
+        k, sample = len(look.which), self.sample
+        rows = np.tile(values, (1 + k, 1))
+        rows[1 + np.arange(k), look.which] += look.steps
+        settings = [{**self.scene.setting, self._placed(look, ends): tuple(row)} for row in rows]
+        for shift in ([-sample, 0.0], [0.0, sample]):
+            placed = self._placed(look, np.add(ends, shift))
+            settings.append({**self.scene.setting, placed: tuple(values)})
+        left = self.local.left(settings).reshape(len(settings), -1)
+        columns = (left[:1] - left[1:]).T
+        size = np.linalg.norm(columns, axis=0) + 1e-300
+        inverse = np.linalg.pinv((columns / size).T @ (columns / size), rcond=1e-9)
+        freedom = max(self.local.rows.sum() - columns.shape[1], 1)
+        chi2 = float((left[0] ** 2).sum())
+        error = np.sqrt(np.diag(inverse) * max(chi2 / freedom, 1.0)) / size
+        half = np.zeros(len(values))
+        half[look.which] = stats.t.ppf(0.975, freedom) * error[:k] * look.steps
+        return chi2, half
+
+    def lasting(self, gain, curves):
+        """Whether a force that acts whenever the motion is like that gains half as much as the event did."""
+        scene, setting = self.scene, self.scene.setting
+        plain = scene.left([setting])[0]
+        for curve in curves:
+            if "time" in curve.variables:
+                continue
+            column = plain - scene.left([{**setting, curve.candidate: curve.values}])[0]
+            if (column * plain).sum() ** 2 > 0.5 * gain * max((column**2).sum(), 1e-300):
+                return True
+        return False
+
+    def others(self, event, looks, found, gain):
+        """((candidate, values), ...) of what explains an event as well, at its times, best first."""
+        inside, out = self.inside, []
+        most = SAME * (event.left - self.chi2.sum() + self.around)
+        for look in looks:
+            amounts = solved(look.gram[inside].sum(0), look.score[inside].sum(0))
+            if look is found or amounts @ look.score[inside].sum(0) < ALIKE * gain:
+                continue
+            values = look.values(amounts)
+            left, more = self._fits(look, [event.time], values)[0]
+            if left < most:
+                out.append((left, self._placed(look, event.time), look.values(amounts + more)))
+        out.sort(key=lambda item: item[0])
+        return tuple((candidate, values) for _, candidate, values in out[:3])
+
+
+def solved(gram, score):
+    """gram^-1 score of small, perhaps singular matrices: (..., k, k), (..., k) -> (..., k)."""
+    size = np.sqrt(np.maximum(np.einsum("...kk->...k", gram), 1e-300))
+    block = gram / size[..., None, :] / size[..., None] + 1e-8 * np.eye(size.shape[-1])
+    return np.linalg.solve(block, (score / size)[..., None])[..., 0] / size

@@ -1,0 +1,71 @@
+"""Events: a load and a push that were put in for a while, and none where there is none or where the motion explains it."""
+
+import mujoco
+import numpy as np
+import pytest
+from plants import DRIVEN_PENDULUM, NOISE, recorded
+
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.recordings.recording import Recording
+from diagnosis.selection import transients
+from diagnosis.simulation.simulator import World
+
+
+def loaded(seed, lasting, carried, between, rows=400):
+    """A run of the pendulum, `lasting` times as heavy as nominal, for a while `carried` times, in stock MuJoCo."""
+    rng, time = np.random.default_rng(seed), 0.01 * np.arange(rows)
+    models = [
+        mujoco.MjModel.from_xml_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5 * ratio))
+        for ratio in (lasting, carried)
+    ]
+    data, period = mujoco.MjData(models[0]), rng.uniform(0.6, 1.2, 3)
+    ctrl = (0.4 * np.sin(2 * np.pi * time[:, None] / period)).sum(1, keepdims=True)
+    qpos = np.empty((rows, 1))
+    for t in range(rows):
+        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
+        mujoco.mj_step(models[int(between[0] <= time[t] < between[1])], data, 2)
+    noisy = qpos + NOISE * rng.normal(size=qpos.shape)
+    return Recording("run.csv", time, noisy, np.full((rows, 1), np.nan), ctrl, {})
+
+
+def found(runs, setting=None):
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    setting = {world.candidate(*c): v for c, v in (setting or {}).items()}
+    smoother = Smoother(world, runs)
+    trajectory = smoother.locate(setting)
+    return transients.find(world, runs, setting, trajectory, smoother.position_noise)
+
+
+def test_a_load_on_top_of_a_lasting_one_is_placed_in_time_and_weighed():
+    event = found([loaded(2, 3.0, 4.0, (1.6, 2.4))], {("mass", "arm"): (1.5,)})
+    told = transients.finding(event)
+    [p] = told["parameters"]
+    assert told["effect"] == "payload_change" and told["written_as"] == "none"
+    assert told["when"]["time"] == pytest.approx([1.6, 2.4], abs=0.03)
+    assert p["low"] < 2.0 < p["high"] and p["high"] - p["low"] < 0.1
+    assert told["evidence"]["p_value"] < 1e-3 and told["evidence"]["error_removed_there"] > 0.8
+
+
+def test_a_push_is_placed_in_time_and_what_is_calm_is_cut_out():
+    runs = [
+        recorded("calm.csv", 0),
+        recorded("pushed.csv", 1, push=lambda time, q, v: 0.3 * (1.5 < time < 2.5)),
+    ]
+    event = found(runs)
+    assert event.recording is runs[1] and event.time == pytest.approx((1.5, 2.5), abs=0.1)
+    parts = transients.calm(runs, event)
+    assert parts[0] is runs[0] and [r.name for r in parts] == ["calm.csv"] + ["pushed.csv"] * 2
+    assert parts[1].time[-1] < event.time[0] and parts[2].time[0] > event.time[1]
+    np.testing.assert_array_equal(parts[2].qpos, runs[1].qpos[-len(parts[2].time) :])
+
+
+@pytest.mark.parametrize(
+    "push",
+    [
+        None,
+        lambda time, q, v: -0.1 * np.tanh(v / 0.01),
+        lambda time, q, v: -0.2 * max(v - 3.5, 0.0),  # few windows are so fast
+    ],
+)
+def test_what_lasts_is_no_event(push):
+    assert found([recorded(f"run{i}.csv", i, push=push) for i in range(2)]) is None
