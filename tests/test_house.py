@@ -18,6 +18,7 @@ FLOORS = (
     ("diagnosis.simulation", "diagnosis.trials"),
     ("diagnosis.estimation",),
     ("diagnosis.selection",),
+    ("diagnosis.handover",),
     ("diagnosis.findings", "diagnosis.nominal"),
     ("diagnosis.estimator",),
     ("diagnosis.report", "diagnosis.design"),

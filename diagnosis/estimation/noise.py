@@ -34,6 +34,8 @@ def difference_noise(time, column):
     """
     known = np.isfinite(column)
     time, column, best = time[known], column[known], np.inf
+    if not len(column) or np.ptp(column) == 0:
+        return np.inf
     for stride in STRIDES:
         estimates = []
         for order in ORDERS:

@@ -95,12 +95,13 @@ class Smoother:
     def _floors(self, recordings):
         position, velocity = measurement_noise(self.model, recordings)
         floor = np.concatenate([position, velocity])
+        self.told = np.isfinite(floor)  # channels of which there is enough to tell their noise
         return np.where(np.isfinite(floor), np.maximum(floor, 1e-12) ** 2, 1.0)
 
     def _noise(self):
         nv, out = self.model.nv, np.sqrt(self.R)
         known = np.isfinite(np.concatenate([self.position, self.velocity], 1)).any(0)
-        out = np.where(known, out, np.inf)
+        out = np.where(known & self.told, out, np.inf)
         for dofs in cut.channels(self.model).values():
             out[dofs], out[nv + dofs] = cut.pooled(out[dofs]), cut.pooled(out[nv + dofs])
         return out[:nv], out[nv:]

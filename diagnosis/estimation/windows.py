@@ -1,4 +1,4 @@
-"""Recordings cut into windows: start states, noise, residuals and the error that everybody reports.
+"""Recordings cut into windows: start states, residuals and the error that everybody reports.
 
     windows = consecutive(recording, horizon=0.3)
     start_qpos, start_qvel = recorded_starts(model, windows)
@@ -8,8 +8,6 @@
 A window is (recording, first row, last row), both rows inside. Position differences live in the
 tangent space of the joints (nv numbers), so that quaternions need no special case further up.
 """
-
-import math
 
 import mujoco
 import numpy as np
@@ -226,66 +224,7 @@ def error(model, windows, qpos, noise):
     return float(np.sqrt((square / noise**2).sum() / max(known.sum(), 1))), per_channel
 
 
-# ---- noise -------------------------------------------------------------------------------------
-
-
-def difference_noise(column):
-    """Noise (standard deviation) of one column from its d-th differences, d = 2..6.
-
-    Differences annihilate a smooth motion and keep white noise; a quantile keeps impacts and standstill out. Where
-    the estimate still falls with d the noise is not white (filtered before it was stored): then coarser rows count.
-    Of a reading that mostly stands still it is the rounding to its smallest step; inf where it never moves.
-    """
-    column = column[np.isfinite(column)]
-    best = np.inf
-    for stride in (1, 2, 4):
-        estimates = []
-        for order in range(2, 7):
-            d = np.diff(column[::stride], order)
-            if len(d) < 5:
-                break
-            gain = np.sqrt(math.comb(2 * order, order))
-            estimates.append(np.quantile(np.abs(d), 0.8) / 1.2816 / gain)
-        if not estimates:
-            break
-        best = min(estimates)
-        if len(estimates) < 5 or estimates[-1] > 0.6 * estimates[1]:
-            break
-    if best == 0:
-        step = np.abs(np.diff(column))
-        best = step[step > 0].min(initial=np.inf) / np.sqrt(12)
-    return best
-
-
-def measurement_noise(model, recordings):
-    """First guess of each dof's position and velocity noise, (nv,), (nv,); inf where nothing was measured."""
-    position, velocity = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
-    for dof in range(model.nv):
-        p, v = [], []
-        for recording in recordings:
-            column = _tangent_column(model, recording, dof)
-            p.append(difference_noise(column))
-            v.append(difference_noise(recording.qvel[:, dof]))
-        for noise, found in ((position, p), (velocity, v)):  # of the recordings that measured it
-            found = np.array(found)[np.isfinite(found)]
-            noise[dof] = np.median(found) if len(found) else np.inf
-    for name, dofs in channels(model).items():  # components of one channel share their noise
-        position[dofs] = pooled(position[dofs])
-    return position, velocity
-
-
 def pooled(noise):
     """The noise of a channel, from those of its components that moved; inf where none did."""
     finite = noise[np.isfinite(noise)]
     return np.sqrt(np.mean(finite**2)) if len(finite) else np.inf
-
-
-def _tangent_column(model, recording, dof):
-    for _, kind, q, v in joint_slices(model):
-        if v.start <= dof < v.stop:
-            if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-                return recording.qpos[:, q.start]
-            if kind == mujoco.mjtJoint.mjJNT_FREE and dof < v.start + 3:
-                return recording.qpos[:, q.start + dof - v.start]
-            known = recording.qpos[np.isfinite(recording.qpos[:, q.stop - 4 : q.stop]).all(1)]
-            return np.cumsum(difference(model, known[:-1], known[1:])[:, dof])

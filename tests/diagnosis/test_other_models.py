@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from diagnosis import command as diagnose
-from diagnosis.estimation import residuals
 from diagnosis.estimation import windows as cut
-from diagnosis.estimation.windows import difference_noise
+from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.noise import difference_noise, measurement_noise
+from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings import recording
 from diagnosis.recordings.inverse_dynamics import _variable
-from diagnosis.selection import candidates
-from diagnosis.selection.unmodelled_force import drives
 from diagnosis.simulation.simulator import World
 
 FRAMES = """<mujoco><worldbody>
@@ -119,14 +118,6 @@ def test_a_corrected_model_can_be_diagnosed_again(tmp_path):
     assert np.isfinite(qpos[:, :10]).all()
 
 
-def test_drives_are_the_actuators_of_a_joint():
-    """A tendon's number is not a joint's."""
-    model = mujoco.MjModel.from_xml_string(
-        PENDULUM.replace("<actuator>", '<actuator><position name="servo" joint="k"/>')
-    )
-    assert drives(model, 0) == [] and drives(model, 1) == [0]
-
-
 def test_controls_of_actuators_after_a_passive_one():
     passive = PENDULUM.replace(
         "<actuator>",
@@ -139,9 +130,9 @@ def test_controls_of_actuators_after_a_passive_one():
 
 
 def test_noise_of_a_reading_that_stands_still():
-    assert np.isinf(difference_noise(np.full(500, 0.3)))
+    assert np.isinf(difference_noise(0.01 * np.arange(500), np.full(500, 0.3)))
     steps = np.repeat(np.arange(20), 50) * 0.01  # an encoder at slow speed
-    assert difference_noise(steps) == pytest.approx(0.01 / np.sqrt(12))
+    assert difference_noise(0.01 * np.arange(1000), steps) == pytest.approx(0.01 / np.sqrt(12))
 
 
 def csv(path, rows):
@@ -464,7 +455,7 @@ def tumbling(rows=300, seed=0):
 def test_a_lost_rotation_does_not_silence_the_others():
     model, run = tumbling()
     run.qpos[[0, 40], 3:] = np.nan
-    noise = cut.measurement_noise(model, [run])[0]
+    noise = measurement_noise(model, [run])[0]
     np.testing.assert_allclose(noise, np.repeat([1e-3, 2e-3], 3), rtol=0.3)
 
 
@@ -472,7 +463,7 @@ def test_a_component_that_stands_still_does_not_silence_its_channel():
     model, run = tumbling()
     run.qpos[:, 2] = 0.1
     np.testing.assert_allclose(
-        cut.measurement_noise(model, [run])[0], np.repeat([1e-3, 2e-3], 3), rtol=0.3
+        measurement_noise(model, [run])[0], np.repeat([1e-3, 2e-3], 3), rtol=0.3
     )
 
 
@@ -492,17 +483,11 @@ def test_a_joint_read_once_is_a_joint_that_was_not_measured():
     qpos = np.stack([0.3 * np.sin(2 * time), np.full(300, np.nan)], 1)
     qpos[0, 1] = 0.2
     run = recording.Recording("run", time, qpos, np.full((300, 2), np.nan), np.zeros((300, 1)))
-    assert {
-        o.candidate.place.name
-        for o in candidates.options_of(world, [run])
-        if o.candidate.effect.name == "stribeck_friction"
-    } == {"j"}
-    problem = residuals.Problem(
-        world, cut.consecutive(run, 0.3), np.array([1e-3, np.inf]), np.full(2, np.inf)
-    )
-    assert (problem.taken == 2).all() and candidates.freedom(problem) == problem.rows - 2 * len(
-        problem.windows
-    )
+    smoother = Smoother(world, [run])
+    smoother.locate({}, passes=1)
+    assert np.isfinite(smoother.position_noise[0]) and np.isinf(smoother.position_noise[1])
+    ahead = Ahead(world, cut_ahead([run]), smoother.position_noise)
+    assert ahead.known[..., 0].any() and not ahead.known[..., 1].any()
 
 
 def test_an_offset_and_an_unnamed_force_in_a_joint_with_a_spring():
