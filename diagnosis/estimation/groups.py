@@ -1,10 +1,10 @@
-"""One number fitted to groups of neighbouring windows or rows: its value, its 95 % interval, and how likely it is none.
+"""One number fitted to groups of neighbouring windows or rows: its value, interval and p-value.
 
 line = fitted(gram, score)          # sums of slope² and slope · residual over each group
 line.value, line.half, line.p_value
 
-The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees of
-freedom, as in intervals.py, for one parameter in closed form.
+The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees
+of freedom, as in intervals.py, for one parameter in closed form.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ FEWEST = 4  # groups, below which their spread says nothing
 
 
 class Line(NamedTuple):
-    """value that removes most; half: half width of its 95 % interval; p_value, two-sided, that it is 0."""
+    """value that removes most; half: half width of its 95 % interval; p_value: that it is 0."""
 
     value: float
     half: float
@@ -38,7 +38,10 @@ def summed(group, x):
 
 
 def fitted(gram, score):
-    """The Line through groups' sums gram (G,), score (G,); p_value 1 and no width where too few groups see anything."""
+    """The Line through groups' sums gram (G,), score (G,).
+
+    p_value 1 and no width where too few groups see anything.
+    """
     seen = gram > 0
     gram, score = gram[seen], score[seen]
     if len(gram) < FEWEST:

@@ -1,4 +1,4 @@
-"""An event, an effect that acts only for a while, placed in time and fitted on the windows around it.
+"""An event, an effect that acts only for a while: placed in time, fitted on the windows around it.
 
 local = Local(scene, trajectory, chi2, a, b)         # windows a..b of a Windows
 event = local.event(look, p_value)                   # look: a Look at the effect
@@ -21,9 +21,10 @@ ALIKE = 0.8  # of the event's gain, what another effect must gain to be looked a
 
 @dataclass(frozen=True)
 class Event:
-    """candidate: localised; values; recording; time (from, to), s; low, high: 95 % bounds of the values; p_value:
-    corrected for all that was looked at; removed: share of the error around it; left: squared residual of all
-    windows with it; others [(candidate, values)]: what explains it as well."""
+    """candidate: localised; values; recording; time (from, to), s; low, high: 95 % bounds of the
+    values; p_value: corrected for all that was looked at; removed: share of the error around it;
+    left: squared residual of all windows with it; others: ((candidate, values), ...), what explains
+    it as well."""
 
     candidate: object
     values: tuple
@@ -42,7 +43,7 @@ class Event:
 
 
 class Windows:
-    """Predictions of windows from free start states: residuals in noises, with what start states explain taken out."""
+    """Residuals of windows in noises, with what their start states explain taken out."""
 
     def __init__(self, world, setting, windows, trajectory, noise):
         """trajectory: a smoother.Trajectory under the setting; noise (nv,): of the positions."""
@@ -61,7 +62,7 @@ class Windows:
         self.rows = np.maximum(self.known.sum(1) - self.basis.shape[-1], 1)
 
     def _raw(self, settings, moved=None):
-        """Measured less predicted in noises, (settings, W, rows); 0 where nothing was measured or predicted."""
+        """Measured less predicted in noises, (settings, W, rows); 0 where either is missing."""
         model, n = self.world.model, len(settings)
         moved = np.zeros(2 * model.nv) if moved is None else moved
         qpos = np.tile(
@@ -84,8 +85,9 @@ class Windows:
 
 @dataclass(frozen=True)
 class Look:
-    """An effect that may come and go: timed, the candidate to report; base, its values where it adds nothing;
-    steps (k,) of the columns that show; which of the parameters (k,); score (W, k), gram (W, k, k)."""
+    """An effect that may come and go: timed, the candidate to report; base, its values where it adds
+    nothing; which of the parameters (k,) show; steps (k,) of their columns; score (W, k), gram
+    (W, k, k)."""
 
     timed: object
     base: np.ndarray
@@ -194,7 +196,7 @@ class Local:
         return chi2, half
 
     def lasting(self, gain, curves):
-        """Whether a force that acts whenever the motion is like that gains half as much as the event did."""
+        """Whether a force that acts whenever the motion is like that gains half as much."""
         scene, setting = self.scene, self.scene.setting
         plain = scene.left([setting])[0]
         for curve in curves:
@@ -206,7 +208,7 @@ class Local:
         return False
 
     def others(self, event, looks, found, gain):
-        """((candidate, values), ...) of what explains an event as well, at its times, best first."""
+        """((candidate, values), ...) of what explains an event as well, best first."""
         inside, out = self.inside, []
         most = SAME * (event.left - self.chi2.sum() + self.around)
         for look in looks:

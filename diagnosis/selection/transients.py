@@ -1,13 +1,14 @@
-"""Effects that act only for a while: a load picked up, a push. Where in time is concentrated what the simulator misses?
+"""Effects that act only for a while, a load picked up, a push: where in time is the error?
 
 event = find(world, recordings, setting, trajectory, noise)      # None, or an Event
-event.candidate, event.values, event.when                        # a localised Candidate, {"recording": name, "time": [a, b]}
+event.candidate, event.values                                    # a localised Candidate
+event.when                                                       # {"recording": name, "time": [a, b]}
 finding(event)                                                   # as in diagnosis.json
 
-Short windows follow each other through every recording, begun at the smoothed states, which are free to
-move: what they explain is projected out. The gain of an effect that acts in windows a..b only is that of
-the sums of its scores and Gram matrices over them, so every interval is tested from one simulation per
-effect; then its ends are moved and its values fitted in the simulator.
+Short windows follow each other through every recording, begun at the smoothed states, which are
+free to move: what they explain is projected out. The gain of an effect that acts in windows a..b
+only is that of the sums of its scores and Gram matrices over them, so every interval is tested from
+one simulation per effect; then its ends are moved and its values fitted in the simulator.
 """
 
 from dataclasses import replace
@@ -29,15 +30,16 @@ UNSEEN = 1e-8  # squared size, in noises, of a step that shows nowhere
 
 
 def happened(world, recordings, looks, noise):
-    """The Event that leaves least, of those found under several (setting, trajectory); None if there is none."""
+    """The Event that leaves least, of those under several (setting, trajectory), or None."""
     found = [find(world, recordings, setting, trajectory, noise) for setting, trajectory in looks]
     return min((e for e in found if e), key=lambda e: e.left, default=None)
 
 
 def find(world, recordings, setting, trajectory, noise):
-    """The one interval and effect that explain most of a residual which is concentrated there, or None.
+    """The Event that explains most of a residual which is concentrated in its time, or None.
 
-    trajectory: a smoother.Trajectory under the setting {Candidate: values}; noise (nv,): of positions.
+    trajectory: a smoother.Trajectory under the setting {Candidate: values}; noise (nv,): of the
+    positions.
     """
     windows = [w for r in recordings for w in cut.consecutive(r, SPAN, r.start)]
     number = len(windows)
@@ -105,9 +107,10 @@ def _looks(scene):
 
 
 def _interval(look, windows, usual):
-    """(merit, gain, first, last, spread, look) of the windows in which an effect gains most; None if there are none.
+    """(merit, gain, first, last, spread, look) of the windows in which an effect gains most, or None.
 
-    merit: the gain less what so many parameters gain of nothing. spread: gain per parameter elsewhere.
+    merit: the gain less what so many parameters gain of nothing. spread: gain per parameter
+    elsewhere.
     """
     k, found = len(look.which), []
     alone = (solved(look.gram, look.score) * look.score).sum(-1)
@@ -142,7 +145,7 @@ def quiet(recording, event):
 
 
 def calm(recordings, event):
-    """The recordings without the time of an event, each stretch a Recording: what lasts is searched in these."""
+    """The recordings without the time of an event, each stretch a Recording of its own."""
     return [
         r if (a, b) == (r.start, len(r.time)) else _part(r, a, b)
         for r in recordings
