@@ -85,8 +85,8 @@ class Windows:
 
 @dataclass(frozen=True)
 class Look:
-    """An effect that may come and go: timed, the candidate to report; base, its values where it adds
-    nothing; which of the parameters (k,) show; steps (k,) of their columns; score (W, k), gram
+    """An effect that may come and go: timed, the candidate to report; base, its values where it
+    adds nothing; which of the parameters (k,) show; steps (k,) of their columns; score (W, k), gram
     (W, k, k)."""
 
     timed: object

@@ -1,10 +1,10 @@
-"""The model's own sensors beside the joints': what was recorded of them against what MuJoCo computes from the predicted state.
+"""The model's own sensors beside the joints': what was recorded against what MuJoCo computes.
 
-    errors(world, settings, held_out)                       # {sensor: before, after, noise, unit}
-    faults(world, settings, train, trajectory)              # findings: a bias, scale or delay of one
+    errors(world, settings, held_out)                # {sensor: before, after, noise, unit}
+    faults(world, settings, train, trajectory)       # findings: a bias, scale or delay of one
 
-Nothing is fitted to them but their own faults, and those only where one explains nearly all that is left,
-of sensors of motion: forces are the model's own, and where they differ it may be the model that is wrong.
+Nothing is fitted to them but their own faults, and those only where one explains nearly all that is
+left, of sensors of motion: where forces differ it may be the model that is wrong.
 """
 
 from typing import NamedTuple
@@ -85,7 +85,10 @@ def turns(model, name):
 
 
 def measured(windows, name, width):
-    """(W, T, width) recorded rows of a sensor; NaN where there are none, and at the last, whose control belongs to what follows."""
+    """(W, T, width) recorded rows of a sensor; NaN where there are none, and at the last.
+
+    Its control belongs to what follows.
+    """
     out = np.full((len(windows), max(w.last - w.first + 1 for w in windows), width), np.nan)
     for i, w in enumerate(windows):
         if name in w.recording.sensors:
@@ -109,7 +112,10 @@ def noise_of(recordings, name):
 
 
 def errors(world, settings, recordings):
-    """{sensor: {"before", "after", "noise": RMS over windows as of the reported error, "unit"}}; infinite where it blows up."""
+    """{sensor: {"before", "after", "noise": RMS over windows as of the reported error, "unit"}}.
+
+    Infinite where it blows up.
+    """
     known, windows, out = (
         recorded(world.model, recordings),
         prediction_error.consecutive(recordings, cut.HORIZON),
@@ -147,11 +153,11 @@ def errors(world, settings, recordings):
 
 
 def faults(world, settings, train, trajectory, event=None):
-    """[finding] for every sensor of which a bias, a scale or a delay explains nearly all that the smoothed motion leaves.
+    """[finding] for every sensor of which one fault explains nearly all that the motion leaves.
 
-    trajectory: a smoother.Trajectory of the recordings `train` under the settings: its states are right whatever
-    the model lacks, and so are readings worked out of them. event: of the recordings, in whose time nothing is
-    looked for, or None.
+    trajectory: a smoother.Trajectory of the recordings `train` under the settings: its states are
+    right whatever the model lacks, and so are readings worked out of them. event: of the recordings,
+    in whose time nothing is looked for, or None.
     """
     known = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION]
     tried, out = _tried(world, settings, known, train, trajectory, event) if known else {}, []
@@ -209,7 +215,10 @@ def _tried(world, settings, known, recordings, trajectory, event):
 
 
 def _fitted(candidate, predict, target, group):
-    """The Tried of a fault at the value that suits it. predict(measure): readings (n, k); target (n, k); group (n,)."""
+    """The Tried of a fault at the value that suits it.
+
+    predict(measure): readings (n, k); target (n, k); group (n,).
+    """
     p, measure = candidate.parameters[0], candidate.effect.measure
     value, total = p.nominal, lambda x: groups.summed(group, np.where(here, x, 0.0).sum(1))
     for _ in range(TURNS):
@@ -226,9 +235,9 @@ def _fitted(candidate, predict, target, group):
 
 
 def readings(world, settings, recordings, trajectory):
-    """[(T, nsensordata)] of each recording: what sound sensors show along a smoothed motion, under its located force.
+    """[(T, nsensordata)] of each recording: what sound sensors show along a smoothed motion.
 
-    The last row's control belongs to what follows; it is repeated from the row before.
+    The located force acts, for accelerations. The last row repeats the one before.
     """
     rows = RowMap(world, recordings, settings)
     qpos, qvel, force = (
@@ -254,7 +263,10 @@ def readings(world, settings, recordings, trajectory):
 
 
 def finding(model, tried, noise, tests):
-    """The finding of a sensor's fault, or None where it is not sure enough. tests: how many faults were tried in all."""
+    """The finding of a sensor's fault, or None where it is not sure enough.
+
+    tests: how many faults were tried in all.
+    """
     name, p = tried.candidate.place.name, tried.candidate.parameters[0]
     left, bare = tried.left.sum(), tried.bare.sum()
     if not bare - left > EXPLAINED * max(bare - tried.rows * noise**2, 0.2 * bare):

@@ -1,9 +1,9 @@
 """Effects that act only for a while, a load picked up, a push: where in time is the error?
 
-event = find(world, recordings, setting, trajectory, noise)      # None, or an Event
-event.candidate, event.values                                    # a localised Candidate
-event.when                                                       # {"recording": name, "time": [a, b]}
-finding(event)                                                   # as in diagnosis.json
+event = find(world, recordings, setting, trajectory, noise)   # None, or an Event
+event.candidate, event.values                                 # a localised Candidate
+event.when                                                    # {"recording": name, "time": [a, b]}
+finding(event)                                                # as in diagnosis.json
 
 Short windows follow each other through every recording, begun at the smoothed states, which are
 free to move: what they explain is projected out. The gain of an effect that acts in windows a..b
@@ -107,7 +107,7 @@ def _looks(scene):
 
 
 def _interval(look, windows, usual):
-    """(merit, gain, first, last, spread, look) of the windows in which an effect gains most, or None.
+    """(merit, gain, first, last, spread, look) of the windows in which an effect gains most.
 
     merit: the gain less what so many parameters gain of nothing. spread: gain per parameter
     elsewhere.

@@ -62,7 +62,7 @@ def test_windows_that_blow_up_are_counted_beside_the_curve():
 
 
 def test_the_curve_goes_by_time_whatever_the_sampling():
-    """Of recordings of different rates, against a plain loop over windows and their nearest rows."""
+    """Recordings of different rates, against a plain loop over windows and nearest rows."""
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.5, mass=0.5)))
     fast, uneven = (
         recorded("fast.csv", 5),

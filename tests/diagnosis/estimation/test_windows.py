@@ -11,7 +11,8 @@ from diagnosis.estimation import windows as cut
 from diagnosis.recordings.recording import Recording
 
 FREE = """<mujoco><worldbody><body><freejoint name="f"/><geom size=".1"/>
-  <body><joint name="b" type="ball"/><geom size=".1"/><body pos="0 0 1"><joint name="h"/><geom size=".1"/></body></body></body></worldbody></mujoco>"""
+  <body><joint name="b" type="ball"/><geom size=".1"/>
+  <body pos="0 0 1"><joint name="h"/><geom size=".1"/></body></body></body></worldbody></mujoco>"""
 
 
 @given(st.integers(0, 10**6))
@@ -45,7 +46,8 @@ def test_windows_tile_the_recording(rows, sample, jitter, seed):
 
 def test_unmeasured_states_are_filled_from_velocity():
     model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><body><joint type="slide"/><geom size=".1"/></body></worldbody></mujoco>'
+        '<mujoco><worldbody><body><joint type="slide"/><geom size=".1"/></body></worldbody>'
+        "</mujoco>"
     )
     time = 0.1 * np.arange(11)
     recording = Recording(

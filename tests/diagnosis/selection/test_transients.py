@@ -1,4 +1,4 @@
-"""Events: a load and a push that were put in for a while, and none where there is none or where the motion explains it."""
+"""Events: a load and a push that were put in for a while; none where the motion explains it all."""
 
 import mujoco
 import numpy as np
@@ -12,7 +12,7 @@ from diagnosis.simulation.simulator import World
 
 
 def loaded(seed, lasting, carried, between, rows=400):
-    """A run of the pendulum, `lasting` times as heavy as nominal, for a while `carried` times, in stock MuJoCo."""
+    """A run of a pendulum, `lasting` times as heavy as nominal, for a while `carried` times."""
     rng, time = np.random.default_rng(seed), 0.01 * np.arange(rows)
     models = [
         mujoco.MjModel.from_xml_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5 * ratio))
