@@ -1,0 +1,73 @@
+"""The smoother over blocks against the same problem as one dense Gaussian."""
+
+import numpy as np
+import pytest
+
+from diagnosis.estimation.kalman import smooth
+
+T, B, N, M = 6, 2, 3, 2
+
+
+@pytest.fixture
+def problem():
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(T, B, M))
+    y[1, 0, 0] = y[3, 0] = y[T - 1, 1] = np.nan
+    return {
+        "A": np.eye(N) + 0.3 * rng.normal(size=(T, B, N, N)),
+        "c": rng.normal(size=(T, B, N)),
+        "Q": rng.uniform(0.05, 0.5, (T, B, N)),
+        "y": y,
+        "R": rng.uniform(0.1, 0.5, M),
+        "start": rng.normal(size=(B, N)),
+        "spread": rng.uniform(0.5, 2.0, (B, N)),
+    }
+
+
+def dense(A, c, Q, y, R, start, spread, block):
+    """Mean (T, N), variance (T, N) and log-likelihood of one block, all rows conditioned at once."""
+    drive = np.concatenate([start[block], c[:-1, block].ravel()])
+    noise = np.concatenate([spread[block], Q[:-1, block].ravel()])
+    paths = np.eye(T * N)  # of every disturbance, the states that follow
+    for t in range(1, T):
+        here, before = slice(t * N, (t + 1) * N), slice((t - 1) * N, t * N)
+        paths[here] += A[t - 1, block] @ paths[before]
+    mean, covariance = paths @ drive, paths @ np.diag(noise) @ paths.T
+    seen = np.flatnonzero(np.isfinite(y[:, block]).ravel())
+    pick = np.eye(T * N)[np.array([t * N + i for t in range(T) for i in range(M)])[seen]]
+    error = y[:, block].ravel()[seen] - pick @ mean
+    F = pick @ covariance @ pick.T + np.diag(np.tile(R, T)[seen])
+    gain = covariance @ pick.T @ np.linalg.inv(F)
+    likelihood = -0.5 * (np.linalg.slogdet(F)[1] + error @ np.linalg.solve(F, error))
+    variance = np.diag(covariance - gain @ pick @ covariance)
+    return (mean + gain @ error).reshape(T, N), variance.reshape(T, N), likelihood
+
+
+def test_it_is_the_conditional_mean_and_variance_of_the_dense_problem(problem):
+    found, total = smooth(**problem), 0.0
+    for block in range(B):
+        mean, variance, likelihood = dense(**problem, block=block)
+        np.testing.assert_allclose(found.state[:, block], mean, atol=1e-9)
+        np.testing.assert_allclose(found.variance[:, block], variance, atol=1e-9)
+        total += likelihood
+    assert found.likelihood == pytest.approx(total, abs=1e-9)
+
+
+def test_scores_of_the_variances_are_derivatives_of_the_likelihood(problem):
+    found, small = smooth(**problem), 1e-5
+
+    def slope(name, i):
+        def moved(sign):
+            values = problem[name].copy()
+            values[..., i] *= np.exp(sign * small)
+            return sum(dense(**{**problem, name: values}, block=b)[2] for b in range(B))
+
+        return (moved(1) - moved(-1)) / (2 * small)
+
+    for i in range(N):
+        score = (found.process[0][i] - found.process[1][i]) / 2
+        assert score == pytest.approx(slope("Q", i), abs=1e-6)
+    for i in range(M):
+        # what was measured weighs the squares with R's square, what is expected alike
+        score = problem["R"][i] * (found.measurement[0][i] - found.measurement[1][i]) / 2
+        assert score == pytest.approx(slope("R", i), abs=1e-6)
