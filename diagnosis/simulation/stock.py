@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.estimation import windows as cut
+from diagnosis.simulation.editable_model import FILTERS
 
 
 def compiled(xml):
@@ -38,6 +39,7 @@ def predicted(model, nominal, windows, step=None):
         mine = {w.first: k for k, w in enumerate(windows) if w.recording is recording}
         last = max(windows[k].last for k in mine.values())
         data, now, start = mujoco.MjData(model), None, 0
+        _hold(model, data, drives, np.nan_to_num(recording.ctrl[0, inputs]))
         for row in range(last + 1):
             if now is not None and row <= windows[now].last:
                 out[now, row - start] = data.qpos[q]
@@ -54,6 +56,23 @@ def predicted(model, nominal, windows, step=None):
                     step(model, data)
     model.opt.timestep = length
     return out
+
+
+def _hold(model, data, drives, control):
+    """What waits and what filters begin as after its first control held for long."""
+    data.ctrl[drives] = control
+    for a in range(model.nactuator):
+        if not model.actuator_ctrlnum[a]:
+            continue
+        u = model.actuator_ctrladr[a]
+        value = data.ctrl[u]
+        if model.actuator_ctrllimited[u]:
+            value = np.clip(value, *model.actuator_ctrlrange[u])
+        if model.actuator_delay[a] > 0:
+            past = -model.opt.timestep * np.arange(model.actuator_history[a, 0], 0, -1)
+            mujoco.mj_initCtrlHistory(model, data, a, past, np.full(len(past), value))
+        if model.actuator_actadr[a] >= 0 and model.actuator_dyntype[a] in FILTERS:
+            data.act[model.actuator_actadr[a]] = value
 
 
 def addresses(nominal, model):

@@ -1,0 +1,132 @@
+"""The located force against hidden ones that were put into stock MuJoCo, and against none."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from diagnosis.estimation import windows as cut
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.recordings.recording import Recording
+from diagnosis.simulation.simulator import World
+
+ARM = """<mujoco><option timestep="0.005"/><default><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" damping="0.05"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1"/>
+  <body name="b" pos="0 0 -.3"><joint name="k" axis="0 1 0" damping="0.05"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1"/></body></body></worldbody>
+  <actuator><motor name="m" joint="j"/><motor name="n" joint="k"/></actuator></mujoco>"""
+PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="a">
+  <joint name="j" axis="0 1 0" damping="0.05"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="0.5"/></body></worldbody>
+  <actuator><motor name="m" joint="j"/></actuator></mujoco>"""
+NOISE = 3e-4
+
+
+def moved(xml, seed, push=None, rows=400):
+    """A Recording in stock MuJoCo, and the mean of push(time, qpos, qvel) over each row (rows, nv)."""
+    rng, model = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(xml)
+    data, time = mujoco.MjData(model), 0.01 * np.arange(rows)
+    period, phase = rng.uniform(0.6, 1.5, (2, 3, model.nu))
+    angle = 2 * np.pi * time[:, None, None] / period + 4 * phase
+    ctrl = (0.5 * np.sin(angle)).sum(1)
+    qpos, hidden = np.empty((rows, model.nq)), np.zeros((rows, model.nv))
+    for t in range(rows):
+        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
+        for _ in range(2):
+            if push:
+                data.qfrc_applied[:] = push(data.time, data.qpos, data.qvel)
+            hidden[t] += data.qfrc_applied / 2
+            mujoco.mj_step(model, data)
+    noisy = qpos + NOISE * rng.normal(size=qpos.shape)
+    return Recording(f"{seed}.csv", time, noisy, np.full(qpos.shape, np.nan), ctrl), hidden
+
+
+PUSHES = {
+    "a spring": (PENDULUM, lambda time, q, v: -0.8 * q**3),
+    "a wave": (PENDULUM, lambda time, q, v: [0.1 * np.sin(5 * time)]),
+    "drag at a joint": (ARM, lambda time, q, v: [0.0, -0.1 * v[1] * abs(v[1])]),
+    "both joints": (ARM, lambda time, q, v: [0.5 * np.sin(2 * q[0]), -0.3 * np.tanh(v[1] / 0.3)]),
+}
+
+
+@pytest.mark.parametrize("name", PUSHES)
+def test_the_located_force_is_the_hidden_one_within_its_band(name):
+    xml, push = PUSHES[name]
+    (run, hidden), (more, again) = moved(xml, 0, push), moved(xml, 1, push)
+    smoother = Smoother(World(mujoco.MjSpec.from_string(xml)), [run, more])
+    found = smoother.locate({})
+    rows = np.r_[5:395, 405:795]
+    hidden = np.concatenate([hidden, again])[rows]
+    error = found.force[rows] - hidden
+    acts = np.sqrt(np.mean(hidden**2, 0))
+    for dof in np.flatnonzero(acts):
+        assert np.sqrt(np.mean(error[:, dof] ** 2)) < 0.25 * acts[dof]
+    for dof in np.flatnonzero(acts == 0):
+        assert np.sqrt(np.mean(error[:, dof] ** 2)) < 0.1 * acts.max()
+    # forces that are smoother than a random walk lie within its band more often than it says
+    inside = abs(error) < 1.96 * found.force_sd[rows]
+    assert inside[:, acts > 0].mean() > 0.88
+    assert smoother.position_noise == pytest.approx(NOISE, rel=0.2)
+
+
+@pytest.mark.parametrize("xml", [PENDULUM, ARM])
+def test_of_forces_that_wander_the_band_holds_what_it_says(xml):
+    inside = []
+    for seed in range(3):
+        walk = 0.02 * np.cumsum(np.random.default_rng(seed).normal(size=(400, 2)), 0)
+        push = lambda time, q, v: walk[int(time / 0.01 + 1e-6), : len(q)]
+        run, hidden = moved(xml, seed, push)
+        found = Smoother(World(mujoco.MjSpec.from_string(xml)), [run]).locate({})
+        inside.append(abs(found.force - hidden)[5:-5] < 1.96 * found.force_sd[5:-5])
+    assert 0.88 < np.mean(inside) < 0.99
+
+
+@pytest.mark.parametrize("xml", [PENDULUM, ARM])
+def test_where_nothing_is_missing_no_force_is_located(xml):
+    run, _ = moved(xml, 2)
+    smoother = Smoother(World(mujoco.MjSpec.from_string(xml)), [run])
+    found = smoother.locate({})
+    usual = np.sqrt(np.mean(found.force**2, 0)) / smoother.scale
+    assert (usual < 0.01).all()
+    assert (abs(found.force) < 3 * found.force_sd).mean() > 0.95
+
+
+def test_states_are_better_than_measured_and_their_bands_hold():
+    run, _ = moved(PENDULUM, 3, lambda time, q, v: -0.05 * np.sign(v))
+    rng = np.random.default_rng(9)
+    noise = NOISE * rng.normal(size=run.qpos.shape)
+    clean = replayed(PENDULUM, 3)
+    run = Recording("run", run.time, clean[0] + noise, run.qvel, run.ctrl)
+    smoother = Smoother(World(mujoco.MjSpec.from_string(PENDULUM)), [run])
+    found = smoother.locate({})
+    error, speed = found.qpos - clean[0], found.qvel - clean[1]
+    assert np.sqrt(np.mean(error**2)) < 0.8 * NOISE
+    assert 0.88 < (abs(error) < 1.96 * found.qpos_sd).mean() < 0.995
+    assert 0.88 < (abs(speed) < 1.96 * found.qvel_sd).mean() <= 1.0
+    windows = cut.consecutive(run)
+    qpos, qvel = found.at(windows)
+    np.testing.assert_array_equal(qpos[3], found.qpos[windows[3].first])
+    np.testing.assert_array_equal(qvel[3], found.qvel[windows[3].first])
+
+
+def replayed(xml, seed, rows=400):
+    """qpos, qvel (rows, 1) of moved(..., Coulomb friction), without noise."""
+    run, _ = moved(xml, seed, lambda time, q, v: -0.05 * np.sign(v), rows)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, qpos, qvel = mujoco.MjData(model), np.empty((rows, 1)), np.empty((rows, 1))
+    for t in range(rows):
+        qpos[t], qvel[t], data.ctrl[:] = data.qpos, data.qvel, run.ctrl[t]
+        for _ in range(2):
+            data.qfrc_applied[:] = -0.05 * np.sign(data.qvel)
+            mujoco.mj_step(model, data)
+    return qpos, qvel
+
+
+def test_under_the_right_correction_the_force_is_gone():
+    run, _ = moved(PENDULUM, 4, lambda time, q, v: -0.1 * v)
+    world = World(mujoco.MjSpec.from_string(PENDULUM))
+    smoother = Smoother(world, [run])
+    before = smoother.locate({})
+    after = smoother.locate({world.candidate("viscous_damping", "j"): (0.15,)}, before)
+    rms = lambda t: np.sqrt(np.mean(t.force[5:-5] ** 2))
+    assert rms(after) < 0.1 * rms(before)

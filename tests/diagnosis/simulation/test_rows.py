@@ -1,0 +1,118 @@
+"""One row ahead against plain loops of mj_step, and its derivatives against central differences."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from diagnosis.recordings.recording import Recording
+from diagnosis.simulation.rows import RowMap
+from diagnosis.simulation.simulator import World
+
+ARM = """<mujoco><option timestep="0.002" density="1.2"/><default>
+  <geom contype="0" conaffinity="0"/></default><worldbody>
+  <body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" damping="{damping}"/>
+  <geom type="capsule" fromto="0 0 0 .1 0 -.3" size=".02" mass="1"/>
+  <body name="b" pos="0 0 -.3"><joint name="k" axis="0 1 0" damping="0.02"/>
+  <geom type="capsule" fromto="0 0 0 0 .1 -.3" size=".02" mass="0.5"/></body></body></worldbody>
+  <actuator><motor name="m" joint="j" gear="2"/><position name="s" joint="k" kp="{kp}" kv="0.2"/>
+  </actuator></mujoco>"""
+FREE = """<mujoco><option timestep="0.002" gravity="0 0 -1"/><worldbody><body name="a">
+  <freejoint/><geom type="box" size=".1 .2 .3" mass="1"/></body></worldbody></mujoco>"""
+
+
+def world():
+    return World(mujoco.MjSpec.from_string(ARM.format(damping=0.05, kp=8)))
+
+
+def uneven(model, seed=0, rows=12):
+    """A Recording whose rows are 6, 10 or 14 ms apart, all of whole steps."""
+    rng = np.random.default_rng(seed)
+    time = np.concatenate([[0.0], np.cumsum(rng.choice([0.006, 0.01, 0.014], rows - 1))])
+    ctrl = rng.uniform(-1, 1, (rows, model.nu))
+    return Recording(
+        "run", time, np.zeros((rows, model.nq)), np.full((rows, model.nv), np.nan), ctrl
+    )
+
+
+def stepped(model, recording, row, qpos, qvel, force):
+    """The state one row later, by mj_step."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.qfrc_applied[:] = qpos, qvel, force
+    data.ctrl[:] = recording.ctrl[row]
+    seconds = recording.time[row + 1] - recording.time[row]
+    mujoco.mj_step(model, data, round(seconds / model.opt.timestep))
+    return data.qpos.copy(), data.qvel.copy()
+
+
+def some_states(model, count, seed=1):
+    rng = np.random.default_rng(seed)
+    qpos = np.array([random_pose(model, rng) for _ in range(count)])
+    return qpos, rng.normal(size=(count, model.nv)), 0.3 * rng.normal(size=(count, model.nv))
+
+
+def random_pose(model, rng):
+    qpos = model.qpos0.copy()
+    mujoco.mj_integratePos(model, qpos, rng.normal(size=model.nv), 1.0)
+    return qpos
+
+
+def test_a_row_ahead_is_what_mujoco_steps_whatever_its_length():
+    here = world()
+    run = uneven(here.model)
+    setting = {
+        here.candidate("viscous_damping", "j"): (0.3,),
+        here.candidate("gain", "m"): (1.3,),
+    }
+    model = mujoco.MjModel.from_xml_string(ARM.format(damping=0.3, kp=8))
+    model.actuator_gainprm[0, 0] = 1.3
+    rows = RowMap(here, [run, run], setting)
+    assert rows.begin.tolist() == [*range(11), *range(12, 23)]
+    qpos, qvel, force = some_states(model, len(rows.begin))
+    q, v = rows.ahead(np.arange(len(rows.begin)), qpos, qvel, force)
+    for k, row in enumerate(rows.begin):
+        expected = stepped(model, run, row % 12, qpos[k], qvel[k], force[k])
+        np.testing.assert_allclose(q[k], expected[0], atol=1e-9)
+        np.testing.assert_allclose(v[k], expected[1], atol=1e-9)
+
+
+@pytest.mark.parametrize("xml", [ARM.format(damping=0.05, kp=8), FREE])
+def test_derivatives_are_central_differences_of_stock_steps(xml):
+    here = World(mujoco.MjSpec.from_string(xml))
+    model, nv, small = here.model, here.model.nv, 1e-5
+    run = uneven(model, rows=5)
+    rows = RowMap(here, [run], {})
+    qpos, qvel, force = some_states(model, 4)
+    q, v, A, B = rows.linearised(qpos, qvel, force, np.ones(nv))
+
+    def moved(k, column, sign):
+        state = [qpos[k].copy(), qvel[k].copy(), force[k].copy()]
+        if column < nv:
+            mujoco.mj_integratePos(model, state[0], sign * small * np.eye(nv)[column], 1.0)
+        else:
+            state[column // nv][column % nv] += sign * small
+        return stepped(model, run, k, *state)
+
+    for k in range(4):
+        for column in range(3 * nv):
+            up, down = moved(k, column, 1), moved(k, column, -1)
+            slope = np.empty(nv)
+            mujoco.mj_differentiatePos(model, slope, 2 * small, down[0], up[0])
+            slope = np.concatenate([slope, (up[1] - down[1]) / (2 * small)])
+            own = np.concatenate([A[k], B[k]], 1)[:, column]
+            np.testing.assert_allclose(own, slope, atol=2e-4 * max(1.0, abs(slope).max()))
+
+
+def test_a_constant_push_on_a_body_is_one_in_its_joints():
+    here = world()
+    run = uneven(here.model)
+    rows = RowMap(here, [run], {here.candidate("external_force", "b"): (1.0, 0.0, -2.0)})
+    qpos, qvel, force = some_states(here.model, len(rows.begin))
+    q, v = rows.ahead(np.arange(len(rows.begin)), qpos, qvel, force)
+    for k, row in enumerate(rows.begin):
+        data = mujoco.MjData(here.model)
+        data.qpos[:], data.qvel[:], data.qfrc_applied[:] = qpos[k], qvel[k], force[k]
+        data.ctrl[:], data.xfrc_applied[2, :3] = run.ctrl[row], (1.0, 0.0, -2.0)
+        count = round((run.time[row + 1] - run.time[row]) / 0.002)
+        mujoco.mj_step(here.model, data, count)
+        # the force turns with the arm inside a row, which the row takes as it begins
+        assert np.abs(v[k] - data.qvel).max() < 0.02 * np.abs(data.qvel - qvel[k]).max() + 2e-3
