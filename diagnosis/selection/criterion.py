@@ -162,20 +162,26 @@ def _weights(residual, inside):
 
 
 def bounded(matrix, vector, low, high):
-    """The minimum of x' matrix x / 2 - vector x between bounds, by fixing what goes beyond them."""
+    """The minimum of x' matrix x / 2 - vector x between bounds, by an active set of those met."""
     p, fixed = len(vector), np.zeros(len(vector), bool)
-    x = np.zeros(p)
+    x = np.clip(np.zeros(p), low, high)
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    for _ in range(p + 1):
-        free = ~fixed
-        if free.any():
-            s = scale[free]
-            a = matrix[np.ix_(free, free)] / np.outer(s, s) + 1e-9 * np.eye(free.sum())
-            b = (vector[free] - matrix[np.ix_(free, fixed)] @ x[fixed]) / s
-            x[free] = np.linalg.solve(a, b) / s
-        beyond = free & ((x < low) | (x > high))
-        if not beyond.any():
+    even = matrix / np.outer(scale, scale) + 1e-9 * np.eye(p)
+    for _ in range(4 * p + 1):
+        free = np.flatnonzero(~fixed)
+        if len(free):
+            push = vector[free] / scale[free] - even[np.ix_(free, fixed)] @ (x * scale)[fixed]
+            step = np.linalg.solve(even[np.ix_(free, free)], push) / scale[free] - x[free]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                room = np.where(step > 0, high[free] - x[free], low[free] - x[free]) / step
+            share = np.min(np.where(step == 0, 1.0, room), initial=1.0)
+            x[free] = np.clip(x[free] + share * step, low[free], high[free])
+            if share < 1:
+                fixed[free[room <= share]] = True
+                continue
+        slope = matrix @ x - vector
+        inward = np.where(x - low < high - x, -slope, slope) / scale * (fixed & (low < high))
+        if not fixed.any() or inward.max() <= 1e-9 * abs(vector / scale).max(initial=0.0):
             break
-        x = np.clip(x, low, high)
-        fixed |= beyond
+        fixed[np.argmax(inward)] = False
     return x

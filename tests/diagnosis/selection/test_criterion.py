@@ -1,0 +1,112 @@
+"""The criterion: false alarms on pure noise, known improvements, ties, bounds."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+from synthetic import clustered, evidence_of, free, scene
+
+from diagnosis.selection.criterion import Score, bounded, paired
+
+
+def test_p_values_of_pure_noise_are_even():
+    rng, p = np.random.default_rng(0), []
+    for _ in range(1000):
+        before, after = rng.normal(size=(2, 16))
+        p.append(paired(Score(before.mean(), before, ()), Score(after.mean(), after, ())).p_value)
+    for level in (0.01, 0.05, 0.5):
+        spread = np.sqrt(level * (1 - level) / 1000)
+        assert np.mean(np.array(p) < level) == pytest.approx(level, abs=3 * spread)
+
+
+def test_paired_is_students_on_differences():
+    before, after = np.array([3.0, 4.0, 5.0, 7.0]), np.array([2.0, 3.5, 4.0, 5.0])
+    found = paired(Score(before.mean(), before, ()), Score(after.mean(), after, ()))
+    d = before - after
+    assert found.gain == pytest.approx(d.mean())
+    assert found.spread == pytest.approx(d.std(ddof=1) / 2)
+    same = Score(1.0, before, ())
+    assert paired(same, same).p_value == 1.0
+
+
+def alone(rng, ahead, amount):
+    """Comparison of none with one column that is in the residual by an amount, in noises."""
+    column, residual = clustered(rng, ahead, (1,)), clustered(rng, ahead)
+    evidence = evidence_of(ahead, residual + amount * column[..., 0], column)
+    return paired(free(evidence, ()), free(evidence, (0,))), free(evidence, (0,)).amounts[0]
+
+
+def test_columns_of_noise_are_no_improvement():
+    rng, ahead = np.random.default_rng(1), scene(bands=2)
+    found = [alone(rng, ahead, 0.0)[0] for _ in range(300)]
+    # what is predicted with the other groups' amounts gets worse by a column that says nothing
+    assert np.mean([f.gain for f in found]) < 0
+    assert np.mean([f.p_value < 0.05 for f in found]) < 0.05 + 2 * np.sqrt(0.05 * 0.95 / 300)
+
+
+def test_a_known_improvement_is_found_at_its_size():
+    rng, ahead = np.random.default_rng(2), scene(channels=2, bands=2)
+    for _ in range(20):
+        comparison, amount = alone(rng, ahead, 1.0)
+        assert comparison.p_value < 1e-3 and comparison.gain > 0.3
+        assert amount == pytest.approx(1.0, abs=0.5)
+
+
+def test_the_loss_is_the_mean_log_error_of_groups_left_out():
+    """Against a plain loop; a hundredth of the usual square before counts as none."""
+    rng, ahead = np.random.default_rng(3), scene(groups=5, windows=1, noise=1e-9)
+    column, residual = rng.normal(size=(*ahead.known.shape, 1)), rng.normal(size=ahead.known.shape)
+    residual = residual + 2.0 * column[..., 0]
+    score = free(evidence_of(ahead, residual, column), (0,))
+    for g in range(5):
+        weight = np.array(
+            [1 / np.mean((residual[k] - 2.0 * column[k, ..., 0]) ** 2) for k in range(5)]
+        )
+        rest = [k for k in range(5) if k != g]
+        top = sum(weight[k] * (column[k, ..., 0] * residual[k]).sum() for k in rest)
+        value = top / sum(weight[k] * (column[k] ** 2).sum() for k in rest)
+        square = np.mean((residual[g] - value * column[g, ..., 0]) ** 2)
+        none = 0.01 * np.median((residual**2).mean((1, 2)))
+        assert score.groups[g] == pytest.approx(0.5 * np.log(square + none), abs=0.005)
+    assert score.loss == pytest.approx(score.groups.mean())
+
+
+def test_effects_that_do_the_same_tie():
+    rng, ahead = np.random.default_rng(4), scene()
+    column, noise = clustered(rng, ahead, (1,)), clustered(rng, ahead)
+    twins = np.concatenate([column, -3.0 * column], -1)
+    evidence = evidence_of(ahead, noise + column[..., 0], twins)
+    one, other, both = (free(evidence, c) for c in ((0,), (1,), (0, 1)))
+    assert one.loss == pytest.approx(other.loss, abs=1e-6)
+    assert other.amounts[0] == pytest.approx(-one.amounts[0] / 3, rel=1e-5)
+    assert both.loss == pytest.approx(one.loss, abs=1e-3)
+    assert paired(one.__class__(one.loss, one.groups, ()), both).p_value > 0.01
+
+
+def test_a_first_look_is_the_gain_of_least_squares():
+    rng, ahead = np.random.default_rng(5), scene(channels=2)
+    columns, residual = clustered(rng, ahead, (4,)), clustered(rng, ahead)
+    evidence = evidence_of(ahead, residual, columns)
+    start = free(evidence, (1,))
+    gains = evidence.looks((1,), start.amounts, np.zeros(1))
+    weight = evidence._weight(np.array([0, 2]), start.amounts)
+    rows = np.sqrt(weight[ahead.group])[:, None, :] * np.ones(ahead.known.shape)
+    y, x = (rows * residual).ravel(), (rows[..., None] * columns).reshape(-1, 4)
+    left = lambda keep: np.sum(
+        (y - x[:, keep] @ np.linalg.lstsq(x[:, keep], y, rcond=None)[0]) ** 2
+    )
+    for k in (0, 2, 3):
+        assert gains[k] == pytest.approx((left([1]) - left([1, k])) / 2, rel=0.05, abs=1e-3)
+
+
+@given(st.integers(0, 10**6), st.integers(1, 5))
+@settings(max_examples=200, deadline=None)
+def test_bounded_least_squares_are_scipys(seed, size):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(12, size)), rng.normal(size=12)
+    low = -rng.uniform(0, 0.3, size)
+    high = rng.uniform(0, 0.3, size)
+    found = bounded(x.T @ x, x.T @ y, low, high)
+    expected = lsq_linear(x, y, (low, high), method="bvls", tol=1e-12).x
+    np.testing.assert_allclose(found, expected, atol=1e-6)
