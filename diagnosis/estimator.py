@@ -1,9 +1,11 @@
 """The diagnosis in its four verbs: locate, name, model, show.
 
-    diagnosis = identify(world, train, held_out)     # simulator.World, lists of recordings.Recording
+    diagnosis = identify(world, train, held_out)     # simulator.World, lists of
+    recordings.Recording
     diagnosis.summary["findings"]; diagnosis.corrected_xml
 
-Held-out recordings enter only after everything is chosen and fitted: they decide what is handed over.
+Held-out recordings enter only after everything is chosen and fitted: they decide what is handed
+over.
 """
 
 from dataclasses import dataclass
@@ -14,21 +16,26 @@ from diagnosis import findings
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
-from diagnosis.selection import rivals, unmodelled_force
+from diagnosis.selection import rivals, transients, unmodelled_force
 from diagnosis.selection.criterion import paired
 from diagnosis.selection.identification import Found, Identification
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
 
-MATTERS = 0.2  # of a name's force, the size of a curve beside it from which on the name is only the nearest
+# of a name's force, the size of a curve beside it from which on the name is only the nearest, and
+# from which on the curve takes its place
+NEAREST, INSTEAD = 0.25, 0.5
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 
 
 @dataclass
 class Outcome:
-    """All that the report is made of: found (Found), fitted (Fitted set), trajectory (Trajectory under it), others
-    {Candidate: [(other, values)]}, p_values, adequacy {Candidate: Dependence left}, strains {Candidate: words}, left
-    ([Dependence] under the final set), dependences (under the nominal model), handed (Handed), train_check and
+    """All that the report is made of: found (Found), fitted (Fitted set), trajectory (Trajectory
+    under it), others
+    {Candidate: [(other, values)]}, p_values, adequacy {Candidate: Dependence left}, strains
+    {Candidate: words}, left
+    ([Dependence] under the final set), dependences (under the nominal model), handed (Handed),
+    train_check and
     held_check (Check)."""
 
     found: Found
@@ -43,12 +50,14 @@ class Outcome:
     handed: Handed = None
     train_check: Check = None
     held_check: Check = None
+    event: object = None
 
 
 def identify(world, train, held_out, progress=None, log=None):
     """Diagnose a simulator from recordings.
 
-    world: simulator.World; train, held_out: lists of Recording. progress(done, message): called with the share done,
+    world: simulator.World; train, held_out: lists of Recording. progress(done, message): called
+    with the share done,
     0..1; log(message): with every decision. Raises RecordingError where the data say too little.
     """
     say, log = progress or (lambda done, message: None), log or (lambda message: None)
@@ -58,10 +67,21 @@ def identify(world, train, held_out, progress=None, log=None):
         )
     search = Identification(world, train, say, log)
     found = search.run()
+    event = transients.happened(
+        world,
+        train,
+        [(found.fitted.setting, found.trajectory), ({}, found.first)],
+        found.smoother.position_noise,
+    )
+    if event:  # what lasts is searched again where it was not disturbed
+        log(f"  an event: {event.candidate}")
+        search = Identification(world, transients.calm(train, event), say, log)
+        found = search.run()
     say(0.75, "what could stand in a finding's place")
     fitted, others = rivals.classes(search.candidates, found.judge, found.fitted, log)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
+    outcome.event = event
     say(0.85, "checking what is handed over")
     _hand_over(world, train, held_out or train, outcome, log)
     say(0.95, "held-out error")
@@ -78,15 +98,14 @@ def _checked(search, found, fitted, others, log):
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=2)
         if not search.earned(fitted, beside, len(search.candidates)):
             continue
-        log(
-            f"  a curve beside the names: {rest.joint} {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}"
-        )
+        log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         size = _force(found, trajectory, world, rest.joint)
-        if not mine or rest.size > MATTERS * size:
+        if not mine or rest.size > INSTEAD * size:
             fitted = search.pruned(judge, beside)
             break
-        adequacy |= {c: rest for c in mine}
+        if rest.size > NEAREST * size:
+            adequacy |= {c: rest for c in mine}
     others = {c: o for c, o in others.items() if c in fitted.setting}
     p_values = {}
     for out in fitted.setting:
@@ -117,11 +136,13 @@ def _strain(candidate, values, prior):
     if not far[k] > STRAINS:
         return None
     p = candidate.parameters[k]
-    return f"{p.name} {values[k]:.3g} {p.unit}: within {STRAINS * prior.scale[k]:.3g} of {p.nominal:.3g} is usual"
+    usual = f"within {STRAINS * prior.scale[k]:.3g} of {p.nominal:.3g} is usual"
+    return f"{p.name} {values[k]:.3g} {p.unit}: {usual}"
 
 
 def _hand_over(world, train, held, outcome, log):
-    """Fill in the Handed: what of the findings kept-back recordings need; the rest of the findings goes."""
+    """Fill in the Handed: what of the findings kept-back recordings need; the rest of the findings
+    goes."""
     setting = outcome.fitted.setting
     check = Check(world, held, Smoother(world, held), setting)
     outcome.handed = accepted(world, check, setting, log)
@@ -130,5 +151,6 @@ def _hand_over(world, train, held, outcome, log):
         outcome.fitted = outcome.found.judge.fit(kept, steps=0)
     check.locate(kept)
     outcome.held_check = check
-    outcome.train_check = Check(world, train, outcome.found.smoother, kept)
+    smoother = outcome.found.smoother
+    outcome.train_check = Check(world, smoother.recordings, smoother, kept)
     outcome.train_check.trajectory = outcome.trajectory

@@ -1,4 +1,5 @@
-"""What a search found, in the words of the contract: findings with intervals and evidence, errors before, after and at the floor.
+"""What a search found, in the words of the contract: findings with intervals and evidence, errors
+before, after and at the floor.
 
 diagnosis = assemble(world, train, held_out, outcome)
 diagnosis.summary                    # diagnosis.json
@@ -13,6 +14,7 @@ from diagnosis.estimation import prediction_error
 from diagnosis.estimation import windows as cut
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
+from diagnosis.selection import sensor_faults, transients
 
 SCATTER = (
     2.0  # standard deviations of a perfect simulator's squared error, that are nothing unexplained
@@ -23,7 +25,8 @@ POINTS = 400  # of a located force that are told
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """summary: diagnosis.json; corrected_xml, corrected_py ("" where MJCF holds all): files; settings {Candidate: values};
+    """summary: diagnosis.json; corrected_xml, corrected_py ("" where MJCF holds all): files;
+    settings {Candidate: values};
     ranking, traces, located: rows for the report; train, held_out: Recordings."""
 
     summary: dict
@@ -49,12 +52,21 @@ def assemble(world, train, held_out, outcome):
     figures["held_out"]["curve"] = prediction_error.curve(
         world, settings, check.smoother, check.trajectory
     )
+    if others := sensor_faults.errors(world, settings, check.recordings):
+        figures["held_out"]["sensors"] = others
     findings = [_finding(world, c, outcome, bounds, figures["held_out"]) for c in settings]
     findings.sort(
         key=lambda f: (f["effect"] != "unknown", -f["evidence"]["held_out_error_removed"])
     )
+    if outcome.event:
+        findings.append(transients.finding(outcome.event))
+    findings += sensor_faults.faults(
+        world, settings, outcome.found.smoother.recordings, outcome.trajectory, outcome.event
+    )
     findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
-    left = unexplained(figures["held_out"], check.scatter)
+    left = unexplained(
+        *(figures["held_out"][k] for k in ("before", "after", "floor")), check.scatter
+    )
     hint = outcome.left[0] if outcome.left else None
     summary = {
         "format": 2,
@@ -134,7 +146,8 @@ def place_of(candidate):
 
 
 def parameters_of(candidate, values, bounds=None):
-    """[parameter] of a finding; a value that the recordings do not show is None, and so is its interval."""
+    """[parameter] of a finding; a value that the recordings do not show is None, and so is its
+    interval."""
     out = []
     for i, (p, v) in enumerate(zip(candidate.parameters, values)):
         unseen = bounds is not None and bounds[i] is None
@@ -153,15 +166,16 @@ def parameters_of(candidate, values, bounds=None):
 
 
 def removed(without, after, before):
-    """Share of the nominal model's error that a finding removes; a prediction that blows up errs by infinity."""
+    """Share of the nominal model's error that a finding removes; a prediction that blows up errs by
+    infinity."""
     if np.isinf(without) or np.isinf(after):
         return float(np.isinf(without)) - float(np.isinf(after))
     return (without - after) / max(before, 1e-12) if np.isfinite(before) else 0.0
 
 
-def unexplained(figure, scatter):
-    """Share of the nominal model's squared error that is left above a perfect simulator's, and above what that scatters by."""
-    before, after, floor = figure["before"], figure["after"], figure["floor"]
+def unexplained(before, after, floor, scatter):
+    """Share of the nominal model's squared error that is left above a perfect simulator's, and
+    above what that scatters by."""
     if np.isinf(after):
         return 1.0
     share = (after**2 - floor**2 - SCATTER * scatter) / max(before**2, 1e-24)
@@ -178,7 +192,8 @@ def noise_by_channel(model, position_noise):
 
 
 def _figure(world, handed: Handed, check, settings):
-    """Errors before, after (of the files handed over, in stock MuJoCo) and of a perfect simulator, as diagnosis.json has them."""
+    """Errors before, after (of the files handed over, in stock MuJoCo) and of a perfect simulator,
+    as diagnosis.json has them."""
     model = world.model
     out, channels = {}, {}
     for name, files in (("before", handed.nominal), ("after", handed.files)):
@@ -217,7 +232,8 @@ def depends_on(model, candidate):
 
 
 def missing_force(world, outcome):
-    """{joint: rms before and after, unit, what it depends on}: the force that the nominal model lacks."""
+    """{joint: rms before and after, unit, what it depends on}: the force that the nominal model
+    lacks."""
     out, model = {}, world.model
     first, last = outcome.found.first, outcome.trajectory
     for j, kind, _, v in cut.joint_slices(model):
@@ -239,7 +255,8 @@ def missing_force(world, outcome):
 
 
 def located(world, outcome):
-    """[{joint, recording, unit, time, force, sd, position, velocity}] of the nominal model's missing force, thinned."""
+    """[{joint, recording, unit, time, force, sd, position, velocity}] of the nominal model's
+    missing force, thinned."""
     out, model, t = [], world.model, outcome.found.first
     for recording in outcome.found.smoother.recordings[:3]:
         rows = np.arange(*t.rows(recording).indices(len(t.qpos))[:2])

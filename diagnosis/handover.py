@@ -1,4 +1,5 @@
-"""What is handed over predicts better: every finding is kept only if the written files, in stock MuJoCo, need it.
+"""What is handed over predicts better: every finding is kept only if the written files, in stock
+MuJoCo, need it.
 
 handed = accepted(world, check, setting)            # Handed; check: a Check on kept-back recordings
 handed.files.xml, handed.setting
@@ -19,7 +20,8 @@ from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predict
 
 @dataclass(frozen=True)
 class Files:
-    """What of a setting is written: corrected.xml, corrected.py ("" where MJCF holds all), and forms {Candidate: where}."""
+    """What of a setting is written: corrected.xml, corrected.py ("" where MJCF holds all), and
+    forms {Candidate: where}."""
 
     xml: str
     python: str
@@ -49,7 +51,8 @@ class Files:
 
 @dataclass(frozen=True)
 class Handed:
-    """setting: what was kept; files: its Files; nominal: those of the nominal model; without {Candidate: error of the
+    """setting: what was kept; files: its Files; nominal: those of the nominal model; without
+    {Candidate: error of the
     files without it}."""
 
     setting: dict
@@ -59,7 +62,8 @@ class Handed:
 
 
 class Check:
-    """Windows of recordings, as the contract's error has them, with a smoothed trajectory for its floor."""
+    """Windows of recordings, as the contract's error has them, with a smoothed trajectory for its
+    floor."""
 
     def __init__(self, world, recordings, smoother, setting):
         self.world, self.recordings, self.smoother = world, recordings, smoother
@@ -94,7 +98,8 @@ class Check:
 
 
 def accepted(world, check, setting, log=lambda what: None):
-    """The Handed of what of a setting earns its place on kept-back recordings: together better than the nominal
+    """The Handed of what of a setting earns its place on kept-back recordings: together better than
+    the nominal
     model, and each finding better with than without."""
     nominal = Files.of(world, {})
     before = check.error(nominal)
@@ -109,7 +114,5 @@ def accepted(world, check, setting, log=lambda what: None):
         worst = min(held, key=lambda c: without[c], default=None)
         if worst is None or without[worst] > after and after < before:
             return Handed(setting, files, nominal, without)
-        log(
-            f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g}, {before:.4g} nominal"
-        )
+        log(f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with")
         setting = {c: v for c, v in setting.items() if c is not worst}

@@ -2,7 +2,8 @@
 
 ahead = Ahead(world, cut_ahead(recordings), smoother)
 ahead.start(trajectory)
-residual = ahead.residual([{}, {friction: (0.1,)}])      # (settings, W, T, nv), measured less predicted
+residual = ahead.residual([{}, {friction: (0.1,)}])      # (settings, W, T, nv), measured less
+predicted
 """
 
 import numpy as np
@@ -17,7 +18,8 @@ GROUPS = 16  # of neighbouring windows, the units that are left out and compared
 
 
 def cut_ahead(recordings, longest=HORIZONS[-1]):
-    """Windows end to end, as long as the longest horizon, or shorter where that gave fewer than FEWEST."""
+    """Windows end to end, as long as the longest horizon, or shorter where that gave fewer than
+    FEWEST."""
     seconds = [r.time[-1] - r.time[r.start] for r in recordings]
     sample = cut.sampling(recordings)
     longest = max(min(longest, sum(seconds) / FEWEST), 12 * sample)
@@ -82,7 +84,8 @@ class Ahead:
         self.qpos, self.qvel = trajectory.at(self.windows)
 
     def residual(self, settings):
-        """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther than the travel."""
+        """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther
+        than the travel."""
         n, W = len(settings), len(self.windows)
         each = [s for s in settings for _ in range(W)]
         qpos = self.world.simulate(

@@ -2,7 +2,8 @@
 
 bounds = intervals(fitted)          # {candidate: [(low, high) or None, ...]}
 
-The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees of
+The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees
+of
 freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipton, JBES 36 (2018).
 """
 
@@ -13,7 +14,8 @@ UNSEEN = 1e-8  # share of a column's information that the others leave, below wh
 
 
 def intervals(fitted):
-    """{candidate: [(low, high), ...]} of a Fitted set; None for a parameter that the recordings do not show."""
+    """{candidate: [(low, high), ...]} of a Fitted set; None for a parameter that the recordings do
+    not show."""
     evidence, out = fitted.evidence, {}
     options = fitted.columns.options
     index = np.concatenate([[0], *[np.array(o.columns) + 1 for o in options]]).astype(int)

@@ -1,6 +1,7 @@
 """A Kalman smoother over many blocks of rows at once, with the scores of its variances.
 
-Per block: x' = A x + c + noise of variance Q, y = x[:m] + noise of variance R; see Durbin and Koopman,
+Per block: x' = A x + c + noise of variance Q, y = x[:m] + noise of variance R; see Durbin and
+Koopman,
 Time Series Analysis by State Space Methods, sections 4.4 and 7.3 (disturbance smoother).
 """
 
@@ -11,9 +12,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Smoothed:
-    """state (T, blocks, n), variance (T, blocks, n) of each component, and for the variances' updates:
+    """state (T, blocks, n), variance (T, blocks, n) of each component, and for the variances'
+    updates:
 
-    process, measurement: pairs (sum of squares, what that would be at the likelihood's optimum), (n,) or (m,).
+    process, measurement: pairs (sum of squares, what that would be at the likelihood's optimum),
+    (n,) or (m,).
     likelihood: log-likelihood summed over blocks.
     """
 
@@ -27,7 +30,8 @@ class Smoothed:
 def smooth(A, c, Q, y, R, start, spread):
     """Smooth all blocks.
 
-    A (T, b, n, n), c (T, b, n): from row t to t + 1; Q (T, b, n): variances of its noise. y (T, b, m): the
+    A (T, b, n, n), c (T, b, n): from row t to t + 1; Q (T, b, n): variances of its noise. y (T, b,
+    m): the
     first m components as measured, NaN where not; R (m,). start (b, n), spread (b, n): mean and
     variances before the first row. The last row's A, c and Q are not used.
     """
@@ -68,7 +72,8 @@ def smooth(A, c, Q, y, R, start, spread):
 
 
 def _forward(A, c, Q, y, known, R, start, spread):
-    """Predicted states and covariances, gains (T, b, n, m), F^-1 (T, b, m, m) with 0 for what is not measured, errors."""
+    """Predicted states and covariances, gains (T, b, n, m), F^-1 (T, b, m, m) with 0 for what is
+    not measured, errors."""
     T, b, n = c.shape
     m = y.shape[-1]
     x, P = start.copy(), np.einsum("bi,ij->bij", spread, np.eye(n))

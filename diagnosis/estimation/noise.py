@@ -1,6 +1,7 @@
 """Measurement noise from the recordings alone: a floor for what a smoother may call noise.
 
-position, velocity = measurement_noise(model, recordings)       # (nv,), (nv,); inf where never measured
+position, velocity = measurement_noise(model, recordings)       # (nv,), (nv,); inf where never
+measured
 """
 
 import mujoco
@@ -27,10 +28,12 @@ def quantum(column):
 
 
 def difference_noise(time, column):
-    """Standard deviation of white noise in one column (T,), by divided differences on its time stamps (T,).
+    """Standard deviation of white noise in one column (T,), by divided differences on its time
+    stamps (T,).
 
     Weights of a divided difference annihilate a polynomial on stamps as they are; scaled to a unit
-    norm they keep the noise's size. A quantile keeps impacts and standstill out. inf where nothing moves.
+    norm they keep the noise's size. A quantile keeps impacts and standstill out. inf where nothing
+    moves.
     """
     known = np.isfinite(column)
     time, column, best = time[known], column[known], np.inf

@@ -1,9 +1,11 @@
-"""What a corrected simulator predicts: the reported error before, after and at the floor, its curve, and traces.
+"""What a corrected simulator predicts: the reported error before, after and at the floor, its
+curve, and traces.
 
     before = prediction_error(world, {}, recordings, noise)        # nominal
     after = prediction_error(world, settings, recordings, noise)
 
-The error is the contract's (windows.error): consecutive windows, start as recorded, in units of the noise.
+The error is the contract's (windows.error): consecutive windows, start as recorded, in units of the
+noise.
 """
 
 import numpy as np
@@ -14,7 +16,8 @@ DRAWS = 4  # of noise, for what a perfect simulator would miss
 
 
 def predict(world, settings, windows, begun=None):
-    """qpos (W, T, nq) and qvel (W, T, nv) of every window from its recorded start, or from the given ones."""
+    """qpos (W, T, nq) and qvel (W, T, nv) of every window from its recorded start, or from the
+    given ones."""
     qpos, qvel = cut.recorded_starts(world.model, windows) if begun is None else begun
     return world.simulate([settings] * len(windows), qpos, qvel, windows)
 
@@ -30,8 +33,10 @@ def prediction_error(world, settings, recordings, noise):
 
 
 def floor_error(world, settings, smoother, trajectory):
-    """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}), and how far the square of the
-    former scatters between recordings of the same motion, noise being what it is (a standard deviation)."""
+    """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}),
+    and how far the square of the
+    former scatters between recordings of the same motion, noise being what it is (a standard
+    deviation)."""
     gap = floor_gaps(world, settings, smoother, trajectory)[:, 1:]
     known = np.isfinite(gap)
     square = np.where(known, gap**2, 0.0)
@@ -49,10 +54,13 @@ def floor_error(world, settings, smoother, trajectory):
 
 
 def floor_gaps(world, settings, smoother, trajectory, horizon=cut.HORIZON):
-    """What a perfect simulator would miss in the windows, or some of many: (DRAWS W, T, nv), NaN where nothing was measured.
+    """What a perfect simulator would miss in the windows, or some of many: (DRAWS W, T, nv), NaN
+    where nothing was measured.
 
-    The corrected model from smoothed states, from one row before each window on, stands for the truth. It is measured
-    anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities by differences; DRAWS
+    The corrected model from smoothed states, from one row before each window on, stands for the
+    truth. It is measured
+    anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
+    by differences; DRAWS
     times, for noise alone makes this vary.
     """
     rng, model = np.random.default_rng(0), world.model
@@ -89,9 +97,11 @@ def reporting_noise(position_noise):
 
 
 def curve(world, settings, smoother, trajectory, longest=3 * cut.HORIZON, points=15):
-    """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t up to `longest`.
+    """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t
+    up to `longest`.
 
-    Windows in which a prediction blew up before t are left out of its error there and counted, with all that were measured
+    Windows in which a prediction blew up before t are left out of its error there and counted, with
+    all that were measured
     then: "blown_up": {"before":, "after":, "of":}, where there are any.
     """
     noise = reporting_noise(smoother.position_noise)
@@ -129,7 +139,8 @@ def curve(world, settings, smoother, trajectory, longest=3 * cut.HORIZON, points
 
 
 def _row_at(seconds, time):
-    """The row of a window that stands nearest to a time after its start; -1 where the window has ended by then."""
+    """The row of a window that stands nearest to a time after its start; -1 where the window has
+    ended by then."""
     row = int(np.argmin(np.abs(seconds - time)))
     return row if row and np.abs(seconds[row] - time) <= 0.51 * np.diff(seconds).max() else -1
 
@@ -151,7 +162,8 @@ def _rms(x):
 
 
 def traces(world, settings, recordings):
-    """[{recording, channel, time, measured, nominal, corrected}] of some held-out recordings; predictions break (NaN) at window starts."""
+    """[{recording, channel, time, measured, nominal, corrected}] of some held-out recordings;
+    predictions break (NaN) at window starts."""
     out, model = [], world.model
     for recording in recordings[:3]:
         windows = cut.consecutive(recording, cut.HORIZON, recording.start)

@@ -1,4 +1,5 @@
-"""Locate: the states of the recorded motion, and the generalized force that the simulator lacks, over time.
+"""Locate: the states of the recorded motion, and the generalized force that the simulator lacks,
+over time.
 
 smoother = Smoother(world, recordings)
 trajectory = smoother.locate({})              # under the nominal model; later under a corrected one
@@ -31,7 +32,8 @@ class Trajectory:
     """Smoothed motion of recordings, rows of all of them one after the other.
 
     qpos (rows, nq), qvel (rows, nv); force (rows, nv): what the simulator lacks, mean over the row
-    that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free (rows,):
+    that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free
+    (rows,):
     where something touches, and no force is told.
     """
 
@@ -55,7 +57,8 @@ class Trajectory:
 
 
 class Smoother:
-    """Smooths recordings under any setting. position_noise, velocity_noise (nv,): standard deviations, once located."""
+    """Smooths recordings under any setting. position_noise, velocity_noise (nv,): standard
+    deviations, once located."""
 
     def __init__(self, world, recordings):
         self.world, self.model, self.recordings = world, world.model, list(recordings)
@@ -78,7 +81,8 @@ class Smoother:
         self.position_noise, self.velocity_noise = self._noise()
 
     def _blocks(self, starts):
-        """Cut all rows into blocks: index (rows of a block, blocks), live where a row is no padding."""
+        """Cut all rows into blocks: index (rows of a block, blocks), live where a row is no
+        padding."""
         blocks = []
         for a, b in zip(starts[:-1], starts[1:]):
             edges = np.linspace(a, b, max(1, round((b - a) / BLOCK)) + 1).astype(int)
@@ -107,7 +111,8 @@ class Smoother:
         return out[:nv], out[nv:]
 
     def _scale(self):
-        """Usual generalized force in each dof (nv,): what holds it and what turns it round in 0.2 s."""
+        """Usual generalized force in each dof (nv,): what holds it and what turns it round in 0.2
+        s."""
         model, data = self.model, mujoco.MjData(self.model)
         some, held = cut.evenly(len(self.qpos), 200), []
         for row in some:
@@ -160,7 +165,8 @@ class Smoother:
         return touch | np.append(touch[1:], False)
 
     def _linear(self, rows, qpos, qvel, force, free):
-        """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a trajectory; extra velocity variance."""
+        """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a
+        trajectory; extra velocity variance."""
         model, nv = self.model, self.model.nv
         now = ~self.last
         q, v, A, B = rows.linearised(qpos[now], qvel[now], force[now], self.scale)

@@ -58,7 +58,8 @@ def joint_slices(model):
 
 
 def difference(model, start, end):
-    """end - start in the tangent space: (..., nq), (..., nq) -> (..., nv), as mj_differentiatePos with dt = 1."""
+    """end - start in the tangent space: (..., nq), (..., nq) -> (..., nv), as mj_differentiatePos
+    with dt = 1."""
     out = np.empty(np.broadcast_shapes(start.shape, end.shape)[:-1] + (model.nv,))
     for _, kind, q, v in joint_slices(model):
         a, b = start[..., q], end[..., q]
@@ -131,7 +132,8 @@ def _filled(time, column, default):
 def states(model, recording):
     """Recorded states without holes: qpos (T, nq), qvel (T, nv).
 
-    qpos as recorded; qvel as measured, else by central difference. What was never measured is made up: positions
+    qpos as recorded; qvel as measured, else by central difference. What was never measured is made
+    up: positions
     by summing measured velocities from the model's qpos0, else qpos0 and rest.
     """
     time = recording.time
@@ -161,9 +163,11 @@ def states(model, recording):
 
 
 def consecutive(recording, horizon=HORIZON, first=0, end=None):
-    """Windows of horizon seconds end to end (one's last row is the next one's first); an incomplete last one is dropped.
+    """Windows of horizon seconds end to end (one's last row is the next one's first); an incomplete
+    last one is dropped.
 
-    first, end: rows of the stretch to cut, end not included. A stretch shorter than the horizon is one window.
+    first, end: rows of the stretch to cut, end not included. A stretch shorter than the horizon is
+    one window.
     """
     time, out = recording.time[:end], []
     sample, start = np.median(np.diff(recording.time)), first
@@ -201,7 +205,8 @@ def position_residual(model, windows, qpos):
 
 
 def gaps(model, windows, qpos):
-    """Measured less predicted (W, T - 1, nv), 0 where nothing was measured, and where something was; what the reported error sums.
+    """Measured less predicted (W, T - 1, nv), 0 where nothing was measured, and where something
+    was; what the reported error sums.
 
     Row 0 of a window is the start and does not count. A prediction that blew up counts as infinite.
     """
@@ -211,7 +216,8 @@ def gaps(model, windows, qpos):
 
 
 def error(model, windows, qpos, noise):
-    """The reported error of predictions qpos (W, T, nq): over all channels (in noises), and per channel (SI).
+    """The reported error of predictions qpos (W, T, nq): over all channels (in noises), and per
+    channel (SI).
 
     noise (nv,).
     """

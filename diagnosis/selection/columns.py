@@ -30,8 +30,10 @@ SECANTS = 24  # candidates that are simulated once more at the values that suit 
 class Option:
     """A candidate at a start.
 
-    base (k,): its values in the setting; directions (p, k): change of the values per unit of each of
-    its p columns; columns (p,): their indices; low, high (p,): bounds of the amounts; prior: a Prior.
+    base (k,): its values in the setting; directions (p, k): change of the values per unit of each
+    of
+    its p columns; columns (p,): their indices; low, high (p,): bounds of the amounts; prior: a
+    Prior.
     """
 
     candidate: object
@@ -69,7 +71,8 @@ def stepwise(world, candidate):
 
 
 def applied(model, qpos, qvel, working):
-    """Generalized forces of actuators and joints (n, nv) at states (n, nq), (n, nv) of the nominal coordinates."""
+    """Generalized forces of actuators and joints (n, nv) at states (n, nq), (n, nv) of the nominal
+    coordinates."""
     data, out = mujoco.MjData(model), np.empty((len(qpos), qvel.shape[1]))
     for row, q, v in zip(out, qpos, qvel):
         data.qpos[working.q], data.qvel[working.v] = q, v
@@ -81,12 +84,14 @@ def applied(model, qpos, qvel, working):
 
 
 class Columns:
-    """Simulates the columns of candidates about a setting. residual (W, T, nv); array (W, T, nv, K); options."""
+    """Simulates the columns of candidates about a setting. residual (W, T, nv); array (W, T, nv,
+    K); options."""
 
     def __init__(
         self, ahead, setting, usual, candidates, residual=None, seen=None, trajectory=None
     ):
-        """residual: of the setting, if it is known; seen: {candidate: which of its parameters show}, of earlier looks."""
+        """residual: of the setting, if it is known; seen: {candidate: which of its parameters
+        show}, of earlier looks."""
         self.ahead, self.setting, self.usual, self.world = ahead, setting, usual, ahead.world
         self.options, self.simulated = [], int(residual is None)
         self.trajectory = trajectory
@@ -146,7 +151,8 @@ class Columns:
         return out
 
     def _promising(self, candidate, whole):
-        """Of starts that come in groups, those of the groups whose force is most like the located one."""
+        """Of starts that come in groups, those of the groups whose force is most like the located
+        one."""
         t, world = self.trajectory, self.world
         rows = np.flatnonzero(~t.free)
         rows = rows[cut.evenly(len(rows), STATES)]
@@ -171,7 +177,8 @@ class Columns:
 
     @staticmethod
     def _ladder(base, prior):
-        """Full-size values of a parameter that only goes one way: what sticks or waits shows in no small step."""
+        """Full-size values of a parameter that only goes one way: what sticks or waits shows in no
+        small step."""
         if len(base) > 1 or base[0] > prior.low[0] or not np.isfinite(prior.scale[0]):
             return []
         return [base + share * prior.scale for share in LADDER]
@@ -222,7 +229,8 @@ class Columns:
             )
 
     def _remember(self, start, shows):
-        """Keep which parameters of a candidate show at all, so that later columns leave out the others."""
+        """Keep which parameters of a candidate show at all, so that later columns leave out the
+        others."""
         candidate, base, directions = start[:3]
         single = (directions != 0).sum(1) == 1
         if single.all() and candidate not in self.seen and len(directions) > 1 and shows.any():
@@ -234,9 +242,11 @@ class Columns:
         return bool((np.sqrt(np.mean(change**2, axis=(0, 1))) > 1e-6 * noise).any())
 
     def secants(self, evidence):
-        """Options of single parameters again, with a column at the value that suits each best alone.
+        """Options of single parameters again, with a column at the value that suits each best
+        alone.
 
-        A small step of what sticks, saturates or is late by less than a row says little of a large one.
+        A small step of what sticks, saturates or is late by less than a row says little of a large
+        one.
         """
         ranked = []
         for k, option in enumerate(self.options):

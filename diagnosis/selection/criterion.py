@@ -1,13 +1,17 @@
-"""The one criterion: log prediction error over horizons, on groups of windows that the values were not fitted to.
+"""The one criterion: log prediction error over horizons, on groups of windows that the values were
+not fitted to.
 
 evidence = Evidence(ahead, residual, columns)          # residual (W, T, nv), columns (W, T, nv, K)
 score = evidence.score([0, 3], low, high, precision, pull)
 score.loss, score.groups, score.amounts
 gain = paired(score, other)
 
-A hypothesis predicts residual - columns @ amounts. Its error counts per cell: a channel (a joint, a free
-joint's position or rotation) in a band of time ahead, in a group of windows. The loss is the sum over
-channels of the mean over bands and groups of log RMS, each group predicted with the others' amounts.
+A hypothesis predicts residual - columns @ amounts. Its error counts per cell: a channel (a joint, a
+free
+joint's position or rotation) in a band of time ahead, in a group of windows. The loss is the sum
+over
+channels of the mean over bands and groups of log RMS, each group predicted with the others'
+amounts.
 """
 
 from dataclasses import dataclass
@@ -15,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-SHARE = 0.1  # of a cell's median error over groups, that counts as none: one still window decides nothing
+# of a cell's median error over groups, that counts as none: one still window decides nothing
+SHARE = 0.1
 NOISE = 0.3  # of the noise, that counts as none
 GROSS = 5.0  # a window's error over the median, from which on it counts no more
 ITERATIONS = 3  # of reweighted least squares
@@ -23,7 +28,8 @@ ITERATIONS = 3  # of reweighted least squares
 
 @dataclass(frozen=True)
 class Score:
-    """loss: sum over channels of mean log RMS; groups (G,): the same of each group; amounts (p,): fitted to all."""
+    """loss: sum over channels of mean log RMS; groups (G,): the same of each group; amounts (p,):
+    fitted to all."""
 
     loss: float
     groups: np.ndarray
@@ -32,7 +38,8 @@ class Score:
 
 @dataclass(frozen=True)
 class Comparison:
-    """gain: loss removed, in nats of log RMS; spread: its standard error over groups; p_value: one-sided, that it is none."""
+    """gain: loss removed, in nats of log RMS; spread: its standard error over groups; p_value:
+    one-sided, that it is none."""
 
     gain: float
     spread: float
@@ -51,7 +58,8 @@ def paired(before, after):
 
 
 class Evidence:
-    """Sums of products of the residual (first) and columns per group and cell: everything a hypothesis needs."""
+    """Sums of products of the residual (first) and columns per group and cell: everything a
+    hypothesis needs."""
 
     def __init__(self, ahead, residual, columns, reference=None):
         """reference (G, cells): floors of the squared error; None makes them of this residual."""
@@ -135,7 +143,8 @@ class Evidence:
         )
 
     def looks(self, columns, amounts, precision):
-        """In-sample gain (K,) in nats of each further column beside some at their amounts: a first look."""
+        """In-sample gain (K,) in nats of each further column beside some at their amounts: a first
+        look."""
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
         weight = self._weight(index, np.asarray(amounts, float))
         whole = np.einsum("gc,gcij->ij", weight, self.gram, optimize=True)

@@ -25,7 +25,8 @@ FINALISTS = 4  # sets that the simulator judges in a round
 
 @dataclass(frozen=True)
 class Found:
-    """What the search ended with: fitted, the Fitted set; bare, the same of the nominal model on the same windows
+    """What the search ended with: fitted, the Fitted set; bare, the same of the nominal model on
+    the same windows
     and start states; trajectory and first, smoothed under it and under the nominal model."""
 
     fitted: Fitted
@@ -144,7 +145,8 @@ class Identification:
         return chosen
 
     def _choose(self, judged, now, number):
-        """The simplest set that is as good as the best, if that earns its place over what there was."""
+        """The simplest set that is as good as the best, if that earns its place over what there
+        was."""
         judged = [f for f in judged if f is now or f.settled]
         best = min(judged, key=lambda f: f.loss)
         if best is now or not self.earned(now, best, number):
@@ -161,7 +163,8 @@ class Identification:
         return min(near, key=lambda f: (complexity(f.setting), f.loss))
 
     def earned(self, before, after, number=1):
-        """Whether a set removes enough of the loss, and by more than groups scatter, for the number looked at."""
+        """Whether a set removes enough of the loss, and by more than groups scatter, for the number
+        looked at."""
         step = paired(before.score, after.score)
         return step.gain >= EARNS and step.p_value < LEVEL / number
 
@@ -174,9 +177,7 @@ class Identification:
             ]
             less = min(tries, key=lambda f: f.loss)
             step = paired(less.score, fitted.score)
-            self.log(
-                f"  without: {less.loss:.3f} {said(less.setting)}; {step.gain:.3f} ± {step.spread:.3f}, p {step.p_value:.2g}"
-            )
+            self.log(f"  without: {less.loss:.3f} {said(less.setting)}; p {step.p_value:.2g}")
             if self.earned(less, fitted):
                 break
             fitted = less

@@ -20,7 +20,8 @@ HALVINGS = 3  # of a step that does not lower the loss
 
 @dataclass(frozen=True)
 class Fitted:
-    """A set of effects refitted. setting: {Candidate: values}; score: of the groups left out, priors included;
+    """A set of effects refitted. setting: {Candidate: values}; score: of the groups left out,
+    priors included;
     columns, evidence: at these values."""
 
     setting: dict
@@ -40,7 +41,8 @@ class Fitted:
 
 
 class Judge:
-    """Refits settings in the simulator on the windows of an Ahead; reference: floors of the cells to compare by."""
+    """Refits settings in the simulator on the windows of an Ahead; reference: floors of the cells
+    to compare by."""
 
     def __init__(self, ahead, usual, reference=None):
         self.ahead, self.usual, self.reference = ahead, usual, reference
@@ -87,7 +89,8 @@ class Judge:
         return plain.score((), *[np.zeros(0)] * 4).loss + self.cost(setting) / evidence.number
 
     def cost(self, setting):
-        """Minus the log prior density of a setting's values, nats; infinite where they are not possible."""
+        """Minus the log prior density of a setting's values, nats; infinite where they are not
+        possible."""
         total = 0.0
         for c, v in setting.items():
             prior = plausible(c, self.usual)
@@ -115,7 +118,8 @@ def problem(columns, chosen):
 
 
 def moved_setting(columns, amounts, chosen=None):
-    """The setting after the amounts of some options (all of them by default), one option after the other."""
+    """The setting after the amounts of some options (all of them by default), one option after the
+    other."""
     moved, at = dict(columns.setting), 0
     for k in range(len(columns.options)) if chosen is None else chosen:
         option = columns.options[k]

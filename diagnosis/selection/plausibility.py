@@ -15,9 +15,11 @@ from diagnosis.estimation import windows as cut
 
 TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 
-# of each effect: (unit, scale, low, high) in that unit, one row for all its parameters or one for each.
+# of each effect: (unit, scale, low, high) in that unit, one row for all its parameters or one for
+# each.
 #   times: ratio to the nominal value      force: share of the joint's usual force
-#   inertia: share of what the joint moves  size: of the body        plain: in the parameter's own unit
+# inertia: share of what the joint moves  size: of the body        plain: in the parameter's own
+# unit
 #   used: share of the largest force asked for     gone: share of the recorded travel
 TABLE = {
     "mass": [("times", 0.4, 0.3, 3.0)],
@@ -88,7 +90,8 @@ STRENGTH = 0.04  # share by which gravity's strength may differ from the model's
 
 @dataclass(frozen=True)
 class Prior:
-    """Of one candidate's parameters (k,): nominal centre and scale of a Student's t; low and high bounds."""
+    """Of one candidate's parameters (k,): nominal centre and scale of a Student's t; low and high
+    bounds."""
 
     centre: np.ndarray
     scale: np.ndarray
@@ -110,7 +113,8 @@ class Prior:
 
 
 class Usual:
-    """What a machine usually does: force (nv,), speed (nv,) and travel (nv,) of each dof, forces asked of actuators."""
+    """What a machine usually does: force (nv,), speed (nv,) and travel (nv,) of each dof, forces
+    asked of actuators."""
 
     def __init__(self, world, recordings, force):
         model = world.model
@@ -167,7 +171,8 @@ class Usual:
 
 
 def plausible(candidate, usual):
-    """The Prior of a candidate on a machine. An effect without a row may have any value its parameters allow."""
+    """The Prior of a candidate on a machine. An effect without a row may have any value its
+    parameters allow."""
     parameters = candidate.parameters
     nominal = np.array([p.nominal for p in parameters], float)
     rows = TABLE.get(candidate.effect.name, [("plain", np.inf, -np.inf, np.inf)])
@@ -186,7 +191,8 @@ def plausible(candidate, usual):
 
 
 def at_limit(candidate, values, prior):
-    """Whether a value lies at a bound of what is plausible: then the truth may lie anywhere beyond."""
+    """Whether a value lies at a bound of what is plausible: then the truth may lie anywhere
+    beyond."""
     values = np.asarray(values, float)
     room = 1e-3 * np.minimum(abs(values) + prior.scale, 1e12)
     ends = (values <= prior.low + room) | (values >= prior.high - room)
@@ -194,7 +200,8 @@ def at_limit(candidate, values, prior):
 
 
 def possible(candidate, values, prior):
-    """Whether values are inside the bounds, and physics as a whole: gravity may tilt, but hardly change its strength."""
+    """Whether values are inside the bounds, and physics as a whole: gravity may tilt, but hardly
+    change its strength."""
     if not prior.inside(np.asarray(values)):
         return False
     if candidate.effect.name == "gravity" and np.linalg.norm(candidate.nominal) > 0:

@@ -1,4 +1,5 @@
-"""What could stand in a finding's place: effects whose refits predict as well, told as a class, the simplest first.
+"""What could stand in a finding's place: effects whose refits predict as well, told as a class, the
+simplest first.
 
 fitted, others = classes(identification, found)      # others: {candidate: [(other, values), ...]}
 """
@@ -9,7 +10,9 @@ from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.identification import EARNS, complexity
 
-ALIKE = 0.7  # cosine of two effects' columns beside the other findings', from which on one may stand for the other
+# cosine of two effects' columns beside the other findings', from which on one may stand for the
+# other
+ALIKE = 0.7
 SAME = 0.03  # loss by which the simplest member of a class may be worse than the one found
 FURTHER = (
     2.5  # how much more complex another member of a class may be: three components for one number
@@ -18,7 +21,8 @@ REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
 def classes(candidates, judge, fitted, log=lambda what: None):
-    """(Fitted, {candidate: [(other, values)]}): each finding by the simplest member of its class, and the other members."""
+    """(Fitted, {candidate: [(other, values)]}): each finding by the simplest member of its class,
+    and the other members."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting:
@@ -55,9 +59,11 @@ def _members(candidates, judge, fitted, candidate):
 
 
 def _alike(judge, fitted, candidate, pool):
-    """[(other, values)] with columns like the candidate's force beside the other findings', most alike first.
+    """[(other, values)] with columns like the candidate's force beside the other findings', most
+    alike first.
 
-    Asked at the model without the finding, for what is gone there is what the others have to explain.
+    Asked at the model without the finding, for what is gone there is what the others have to
+    explain.
     """
     ahead = judge.ahead
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}

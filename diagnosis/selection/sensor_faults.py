@@ -156,7 +156,8 @@ def faults(world, settings, train, trajectory, event=None):
     """[finding] for every sensor of which one fault explains nearly all that the motion leaves.
 
     trajectory: a smoother.Trajectory of the recordings `train` under the settings: its states are
-    right whatever the model lacks, and so are readings worked out of them. event: of the recordings,
+    right whatever the model lacks, and so are readings worked out of them. event: of the
+    recordings,
     in whose time nothing is looked for, or None.
     """
     known = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION]

@@ -1,6 +1,8 @@
-"""A force that no name holds: what the located force depends on, and curves for the simulator to judge.
+"""A force that no name holds: what the located force depends on, and curves for the simulator to
+judge.
 
-for found in dependences(world, trajectory, recordings): found.joint, found.variables, found.candidate
+for found in dependences(world, trajectory, recordings): found.joint, found.variables,
+found.candidate
 """
 
 from dataclasses import dataclass
@@ -13,13 +15,15 @@ from diagnosis.estimation import windows as cut
 
 KNOTS = 9
 BLOCKS = 16  # stretches of time that are left out in turn
-LEAST = 0.03  # share of the located force's variance, predicted on stretches left out, that a curve must explain
+# share of the located force's variance, predicted on stretches left out, that a curve must explain
+LEAST = 0.03
 CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 
 
 @dataclass(frozen=True)
 class Dependence:
-    """share: of the located force's variance at the joint that the curve predicts; size: RMS of the curve's force;
+    """share: of the located force's variance at the joint that the curve predicts; size: RMS of the
+    curve's force;
     candidate, values: the curve and the forces at its knots."""
 
     joint: str

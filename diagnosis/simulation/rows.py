@@ -23,7 +23,8 @@ SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per seco
 class RowMap:
     """Simulates every row of some recordings under a setting, with a constant extra force in each.
 
-    Effects that add coordinates of their own (backlash) or act under a condition are left out: a row
+    Effects that add coordinates of their own (backlash) or act under a condition are left out: a
+    row
     knows the nominal model's coordinates alone.
 
     begin: the rows (n,) that have a next one, counted through all recordings; seconds (n,).
@@ -79,7 +80,8 @@ class RowMap:
         )
 
     def ahead(self, index, qpos, qvel, force):
-        """States after rows `index` (n,) of `begin` from states (n, nq), (n, nv) under force (n, nv).
+        """States after rows `index` (n,) of `begin` from states (n, nq), (n, nv) under force (n,
+        nv).
 
         Returns qpos (n, nq), qvel (n, nv).
         """
@@ -117,7 +119,8 @@ class RowMap:
         return integrate(m, q0, f * difference(m, q0, q1)), v0 + f * (v1 - v0)
 
     def forces(self, index, qpos, qvel):
-        """(n, nv): forces of the setting's effects that depend on the state, as at the row's beginning."""
+        """(n, nv): forces of the setting's effects that depend on the state, as at the row's
+        beginning."""
         n, out = len(index), np.zeros((len(index), self.model.nv))
         xfrc = np.zeros((self.model.nbody, 6))
         constant = np.zeros(self.model.nv)
@@ -165,7 +168,8 @@ class RowMap:
         """What comes out of every row, and its derivatives by forward differences.
 
         qpos (n, nq), qvel (n, nv), force (n, nv) at the rows of `begin`; scale (nv,): usual forces.
-        Returns qpos (n, nq), qvel (n, nv), A (n, 2 nv, 2 nv), B (n, 2 nv, nv) in tangent coordinates.
+        Returns qpos (n, nq), qvel (n, nv), A (n, 2 nv, 2 nv), B (n, 2 nv, nv) in tangent
+        coordinates.
         """
         n, nv, every = len(self.begin), self.model.nv, np.arange(len(self.begin))
         q, v = self.ahead(every, qpos, qvel, force)

@@ -1,4 +1,5 @@
-"""Predictions by stock MuJoCo of a model's file, with nothing of ours in the loop: what a report may promise.
+"""Predictions by stock MuJoCo of a model's file, with nothing of ours in the loop: what a report
+may promise.
 
 qpos = predicted(model, nominal, windows)        # (W, T, nq) in the nominal model's coordinates
 """
@@ -16,10 +17,12 @@ def compiled(xml):
 
 
 def predicted(model, nominal, windows, step=None):
-    """qpos (W, T, nq) of windows that follow each other, each begun as recorded; NaN where there is none.
+    """qpos (W, T, nq) of windows that follow each other, each begun as recorded; NaN where there is
+    none.
 
     Joints and actuators go by the nominal model's names; what the model appends, its actuators'
-    states and delayed controls run on through each recording. step(model, data): instead of mj_step.
+    states and delayed controls run on through each recording. step(model, data): instead of
+    mj_step.
     """
     q, v = addresses(nominal, model)
     drives = np.array(
