@@ -12,9 +12,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from diagnosis.estimation import prediction_error
+from diagnosis.estimation import prediction_error, stock
 from diagnosis.estimation import windows as cut
-from diagnosis.simulation import stock
 from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predictions, python_parts
 
 

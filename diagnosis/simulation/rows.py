@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from diagnosis.common.coordinates import difference, integrate
 from diagnosis.effects.base import runge_kutta
-from diagnosis.estimation.windows import difference, integrate
 from diagnosis.simulation.batch import threads
 from diagnosis.simulation.control_signal import SLACK
 from diagnosis.simulation.simulator import Case

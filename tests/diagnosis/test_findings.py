@@ -35,8 +35,10 @@ def test_findings_tell_where_a_curve_has_its_knots_and_keep_numbers():
 
 
 def test_what_a_motor_at_a_site_depends_on_is_no_joint():
-    xml = """<mujoco><worldbody><body name="drone"><freejoint name="root"/><geom size=".1"/><site name="s"/></body></worldbody>
-      <actuator><motor name="a" site="s" gear="0 0 1 0 0 0"/><motor name="b" site="s" gear="0 0 1 0 0 .1"/></actuator></mujoco>"""
+    xml = """<mujoco><worldbody><body name="drone"><freejoint name="root"/><geom size=".1"/><site
+    name="s"/></body></worldbody>
+      <actuator><motor name="a" site="s" gear="0 0 1 0 0 0"/><motor name="b" site="s" gear="0 0 1 0
+      0 .1"/></actuator></mujoco>"""
     world = World(mujoco.MjSpec.from_string(xml))
     for actuator in "ab":
         assert findings.depends_on(world.model, world.candidate("back_emf", actuator)) == []

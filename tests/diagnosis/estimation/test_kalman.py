@@ -25,7 +25,8 @@ def problem():
 
 
 def dense(A, c, Q, y, R, start, spread, block):
-    """Mean (T, N), variance (T, N) and log-likelihood of one block, all rows conditioned at once."""
+    """Mean (T, N), variance (T, N) and log-likelihood of one block, all rows conditioned at
+    once."""
     drive = np.concatenate([start[block], c[:-1, block].ravel()])
     noise = np.concatenate([spread[block], Q[:-1, block].ravel()])
     paths = np.eye(T * N)  # of every disturbance, the states that follow

@@ -23,7 +23,8 @@ NOISE = 3e-4
 
 
 def moved(xml, seed, push=None, rows=400):
-    """A Recording in stock MuJoCo, and the mean of push(time, qpos, qvel) over each row (rows, nv)."""
+    """A Recording in stock MuJoCo, and the mean of push(time, qpos, qvel) over each row (rows,
+    nv)."""
     rng, model = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(xml)
     data, time = mujoco.MjData(model), 0.01 * np.arange(rows)
     period, phase = rng.uniform(0.6, 1.5, (2, 3, model.nu))

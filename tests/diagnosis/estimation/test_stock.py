@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from diagnosis.estimation import stock
 from diagnosis.estimation import windows as cut
 from diagnosis.recordings.recording import Recording
-from diagnosis.simulation import stock
 from diagnosis.simulation.simulator import World
 
 ARM = """<mujoco><option timestep="0.002"/><default><geom contype="0" conaffinity="0"/></default>
