@@ -274,7 +274,8 @@ def test_the_command_names_the_friction(command):
     assert done.returncode == 0 and done.stderr == "", done.stderr  # no terminal, no progress
     assert "joint pivot: Coulomb friction 0.15" in done.stdout and "was left out" in done.stdout
     assert "Held-out error 0.3 s ahead falls from" in done.stdout
-    assert done.stdout.endswith("Written: report/report.html, diagnosis.json, corrected.xml\n")
+    files = "report/report.html, diagnosis.json, corrected.xml, force_pivot.csv"
+    assert done.stdout.endswith(f"Written: {files}\n")
     assert sorted(os.listdir(folder)) == ["report", "run0.csv", "run1.csv", "run2.csv", "sim.xml"]
     assert {"corrected.xml", "diagnosis.json", "report.html"} <= set(os.listdir(folder / "report"))
 
