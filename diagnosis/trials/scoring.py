@@ -209,17 +209,30 @@ def compare_values(item, finding):
     if set(truth) in ({"x", "y", "z"}, {"ixx", "iyy", "izz"}):
         return tuple(_vector_scores(truth, told))
     return tuple(
-        ValueScore(
-            name,
-            float(value),
-            told[name].get("value") if name in told else None,
-            told[name].get("nominal") if name in told else None,
-            told[name].get("low") if name in told else None,
-            told[name].get("high") if name in told else None,
-        )
+        _value_score(name, float(value), told.get(name, {}))
         for name, value in truth.items()
         if name in told or len(truth) == 1
     )
+
+
+def _value_score(name, truth, told):
+    """ValueScore of one parameter as reported; a phase is compared around the circle."""
+    score, value = ValueScore, told.get("value")
+    if name == "phase":
+        score = _Angle
+        truth += 0.0 if value is None else 2 * math.pi * round((value - truth) / (2 * math.pi))
+    return score(name, truth, value, told.get("nominal"), told.get("low"), told.get("high"))
+
+
+class _Angle(ValueScore):
+    """An angle in rad, judged by half a turn."""
+
+    @property
+    def near(self):
+        """Within 5 % of half a turn."""
+        if self.value is None or not math.isfinite(self.value):
+            return False
+        return abs(self.value - self.truth) <= TOLERANCE * math.pi
 
 
 class _Component(ValueScore):

@@ -126,6 +126,14 @@ def test_interval_not_given():
     assert value.held is None
 
 
+def test_a_phase_is_compared_around_the_circle():
+    item = hidden("cogging", amplitude=2.0, phase=5.71)
+    said = lambda phase: finding("cogging", amplitude=(2.0, 1.9, 2.1), phase=phase)
+    assert score([item], [said((-0.573, -0.6, -0.5))]).strict
+    assert score([item], [said((-0.573, -0.6, -0.5))]).matches[0].values[1].held
+    assert not score([item], [said((0.573, 0.5, 0.6))]).strict
+
+
 def test_vectors_are_judged_by_their_length():
     item = hidden("gravity", "world", "world", x=0.0, y=0.5, z=-9.8)
     near = finding("gravity", "world", "world", x=(0.3, 0, 1), y=(0.3, 0, 1), z=(-9.8, -10, -9))
