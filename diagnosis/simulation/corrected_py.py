@@ -13,6 +13,7 @@ numbers.
 """
 
 import ast
+import json
 import os
 import pprint
 import subprocess
@@ -73,7 +74,7 @@ def corrected_py(parts, joints, xml_name="corrected.xml"):
     if unknown:
         raise ValueError(f"corrected.py has no law {sorted(unknown)[0]!r}")
     replaced = {
-        "XML": f"XML = Path(__file__).with_name({xml_name!r})",
+        "XML": f"XML = Path(__file__).with_name({json.dumps(xml_name)})",
         "JOINTS": _literal("JOINTS", list(joints)),
         "PARTS": _literal("PARTS", [tuple(part) for part in parts]),
     }
@@ -87,7 +88,8 @@ def corrected_py(parts, joints, xml_name="corrected.xml"):
 
 def _literal(name, value):
     """An assignment that reads well."""
-    return f"{name} = " + pprint.pformat(value, width=96 - len(name), sort_dicts=False)
+    text = pprint.pformat(value, width=96 - len(name), sort_dicts=False)
+    return f"{name} = " + (text if '"' in text else text.replace("'", '"'))
 
 
 def _pruned(source, replaced):

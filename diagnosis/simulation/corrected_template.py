@@ -4,10 +4,9 @@
 
     model, data = load()
     data.ctrl[:] = 0.3
-    step(model, data, 100)                                # instead of mujoco.mj_step(model, data,
-    100)
-    qpos, qvel = rollout(model, qpos, qvel, ctrl, time)   # many runs at once
-    install(model)                                        # or: in every mj_step, a viewer's too
+    step(model, data, 100)                    # instead of mujoco.mj_step(model, data, 100)
+    rollout(model, qpos, qvel, ctrl, time)    # many runs
+    install(model)                            # or: in every mj_step, a viewer's too
 
 What is added stands in PARTS, in SI units; the laws are the functions below. A curve is linear
 between its knots and keeps its outermost value beyond them, so nothing grows outside what was
