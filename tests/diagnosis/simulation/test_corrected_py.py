@@ -1,6 +1,7 @@
 """corrected.py: what the script makes of corrected.xml is what the simulator predicts, in a
 process of its own."""
 
+import ast
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,6 +9,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mujoco.batch import Batch
 from plants import DT, SIZES, START, T, arm, commanded, pendulum, record, simulate
 
@@ -275,6 +278,23 @@ def test_a_force_over_a_control_that_comes_late_is_refused_in_a_batch():
     batch = CorrectedBatch(mujoco.MjModel.from_xml_string(xml), 1, 1, parts=parts)
     with pytest.raises(ValueError, match="bend: a batch does not tell its delayed control"):
         batch.step()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.text(max_size=12), st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=4))
+def test_names_and_numbers_come_back_from_the_text_as_they_were(name, forces):
+    """Whatever a joint is called: its name is text in the script, never code."""
+    knots = [float(k) for k in range(len(forces))]
+    numbers = {"of": f"position:{name}", "knots": knots, "forces": forces, "factor": None}
+    parts = [Part("curve", name, numbers)]
+    text = corrected_py(parts, [name], xml_name=f"{name}.xml")
+    assert parts_in(text) == parts
+    tree = ast.parse(text)
+    assigned = {t.id for n in tree.body if isinstance(n, ast.Assign) for t in n.targets}
+    assert "PARTS" in assigned and len(tree.body) == len(ast.parse(PLAIN).body)
+
+
+PLAIN = corrected_py([Part("curve", "j", {})], ["j"])
 
 
 def test_a_script_that_does_not_run_is_one_line(tmp_path):
