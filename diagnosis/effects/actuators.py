@@ -14,6 +14,7 @@ from diagnosis.effects.base import (
     SLIDE,
     Effect,
     Parameter,
+    Part,
     catalogue,
     end_of_step,
     runge_kutta,
@@ -321,29 +322,25 @@ class Delay(ActuatorEffect):
 
     def write(self, spec, model, i, values):
         """MuJoCo reads its history as of each force evaluation, but only what was there before the
-        step."""
+        step: a delay of less than a step is left to corrected.py."""
         seconds, actuator, step = (
             values[0],
             spec.actuator(model.actuator(i).name),
             spec.option.timestep,
         )
         actuator.delay, actuator.nsample = 0.0, 0
-        if not seconds:
-            return "mjcf"
+        if seconds < step:
+            return "python" if seconds else "mjcf"
         if runge_kutta(model):  # evaluates half a step later on average, a whole one at the last
             refine(spec, seconds / 1.5)
             seconds += spec.option.timestep / 2
-        elif seconds < step and actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
-            # a finer step would change everything: spread the command over later steps, as late on
-            # average
-            set_lag(self.general(spec, model, i), end_of_step(seconds, step), model)
-            return "mjcf"
-        else:
-            refine(spec, seconds)
         actuator.delay, actuator.interp = seconds, 1
         # for a spec that is compiled before its time step is final
         actuator.nsample = int(np.ceil(seconds / spec.option.timestep)) + 1
         return "mjcf"
+
+    def part(self, model, i, values):
+        return Part("delay", model.actuator(i).name, {"seconds": float(values[0])})
 
 
 def nominal_delay(model, i):

@@ -56,7 +56,7 @@ def python_parts(model, setting, written=None):
             i = candidate.effect.id(model, candidate.place.name)
             part = candidate.effect.part(model, i, values)
             parts += [part] if isinstance(part, Part) else list(part or ())
-    return parts
+    return sorted(parts, key=lambda part: part.law == "delay")  # of what the others leave
 
 
 def xml_holds(written):

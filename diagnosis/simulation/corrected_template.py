@@ -233,6 +233,15 @@ def rate_limit(look, wanted, memory, rate):
     return value + np.sign(gap) * (rate * reached**2 / 2 + abs(gap) * (h - reached)) / h
 
 
+def delay(look, wanted, memory, seconds):
+    """The control comes later by less than a step: its mean over the step to come."""
+    before, since = memory.get("delay", (wanted, look.time))
+    before = np.where(look.time < since, wanted, before)
+    memory["delay"] = np.copy(wanted), np.copy(look.time)
+    late = min(seconds / look.step, 1.0)
+    return late * before + (1 - late) * wanted
+
+
 def effort_fade(look, wanted, memory, tires):
     """The control loses exp(−tires · E), E the integral of its square since the run began."""
     before, effort, since = memory.get("effort", (wanted, 0.0, look.time))
@@ -244,7 +253,7 @@ def effort_fade(look, wanted, memory, tires):
 FRICTION = {f.__name__: f for f in (stribeck_rest, load_friction, friction_wave, friction_curve)}
 FORCE = {f.__name__: f for f in (curve, wave, surface, stribeck_release)}
 DRIVE = {f.__name__: f for f in (dead_zone_of_force, torque_speed, gain_fade)}
-CONTROL = {f.__name__: f for f in (dead_zone, rate_limit, effort_fade)}
+CONTROL = {f.__name__: f for f in (dead_zone, rate_limit, effort_fade, delay)}
 
 
 # running

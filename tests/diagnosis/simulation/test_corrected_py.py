@@ -94,6 +94,7 @@ def test_the_script_is_the_simulator(tmp_path, kind):
     for candidate in world.candidates:
         if candidate.effect.name in OF_DRIVES:
             named.append({candidate: SIZES[candidate.effect.name]})
+    named.append({world.candidate("delay", "bend"): (0.0007,)})  # less than a step
     settings = named + (curves(world) if kind != "rk4" else [])
     nominal = simulate(world, [{}], recording, ROWS)[0]
     for setting, expected in zip(settings, simulate(world, settings, recording, ROWS)):
@@ -130,6 +131,21 @@ def test_several_at_once_and_beside_what_mjcf_holds(tmp_path):
     expected = simulate(world, [setting], recording, ROWS)[0]
     qpos = in_script(tmp_path, parts, recording)
     np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9)
+
+
+def test_a_delay_of_less_than_a_step_beside_a_dead_zone(tmp_path):
+    """What comes late is what the dead zone left."""
+    world, _ = arm("motors")
+    recording = record(world)
+    setting = {world.candidate("dead_zone", "bend"): (0.4,)}
+    setting[world.candidate("delay", "bend")] = (0.0013,)
+    parts, written = script_of(tmp_path, world, setting)
+    assert [part.law for part in parts] == ["dead_zone", "delay"]
+    expected = simulate(world, [setting], recording, ROWS)[0]
+    qpos = in_script(tmp_path, parts, recording)
+    np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9)
+    whole = {world.candidate("delay", "bend"): (0.002,)}
+    assert set(world.corrected_xml(whole)[1].values()) == {"mjcf"}
 
 
 def test_a_setting_that_mjcf_holds_needs_no_script():
