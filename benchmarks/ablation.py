@@ -115,7 +115,7 @@ def main():
     unknown = sorted(set(names) - set(RULES))
     if unknown:
         sys.exit(f"{', '.join(unknown)}: no rule of that name; RULES has {', '.join(RULES)}")
-    table, out, options.keep = [], options.out, None
+    table, out, options.keep, options.version = [], options.out, None, ROOT
     for name in names:
         script = f"{{python}} {Path(__file__).resolve()} diagnose '{name}'"
         options.tool = f"{script} --model {{model}} --recordings {{recordings}} --out {{out}}"

@@ -35,11 +35,12 @@ from diagnosis.trials.prediction import model_error  # noqa: E402
 from diagnosis.trials.replay import load_runs, replay  # noqa: E402
 from diagnosis.trials.robots import DEVELOPMENT  # noqa: E402
 from diagnosis.trials.scoring import beside, score_findings  # noqa: E402
+from diagnosis.trials.sealing import checked_out  # noqa: E402
 from diagnosis.trials.tools import run_tool  # noqa: E402
 
 COLUMNS = (
     "trial kind joints touches level hidden over_noise verdict said exit needed found first strict "
-    "false unknown_placed prediction error_before error_after error_floor seconds steps note"
+    "false unknown_placed prediction error_before error_after error_floor seconds steps version note"
 ).split()
 KINDS = ("null", "single", "unknown", "pair", "many")
 DIAGNOSE = (
@@ -56,6 +57,7 @@ class Job:
     tool: str
     limit: int
     keep: Path | None
+    version: str
 
 
 def draw(seed, number, cache):
@@ -106,6 +108,7 @@ def score(job):
         "error_floor": f"{floor:.4g}",
         "seconds": f"{done.cpu_seconds:.1f}",
         "steps": ((summary or {}).get("cost") or {}).get("steps", ""),
+        "version": job.version,
         "note": done.note,
     }
 
@@ -227,8 +230,9 @@ def score_all(options):
     rows = read(options.out)
     done = {int(row["trial"]) for row in rows}
     template = options.tool or DIAGNOSE.format(folder=options.version.resolve())
+    version = checked_out(options.version)[:12]
     todo = [
-        Job(number, folder, template, options.limit, options.keep)
+        Job(number, folder, template, options.limit, options.keep, version)
         for number, folder in chosen(options)
         if number not in done
     ]

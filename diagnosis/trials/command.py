@@ -26,6 +26,7 @@ from diagnosis.trials.kept import is_kept
 from diagnosis.trials.robots import DEVELOPMENT
 from diagnosis.trials.sealing import (
     SealError,
+    checked_out,
     git,
     new_keys,
     publishing_commit,
@@ -112,7 +113,7 @@ def do_run(options):
     """Run what is not in the table yet."""
     if options.development:
         count = 60 if options.trials is None else options.trials
-        version = commit_here()
+        version = checked_out(ROOT)
         tasks = [
             Task(n, (options.seed, n), "development", version=version, drawn=kept(options, n))
             for n in range(count)
@@ -128,15 +129,6 @@ def do_run(options):
         options.ray,
         options.minutes,
     )
-
-
-def commit_here():
-    """The commit that is checked out, "+" behind it where files differ; "" without a history."""
-    try:
-        changed = git("status", "--porcelain", "--untracked-files=no", folder=ROOT)
-        return git("rev-parse", "HEAD", folder=ROOT) + ("+" if changed else "")
-    except SealError:
-        return ""
 
 
 def kept(options, number):

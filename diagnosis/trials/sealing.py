@@ -58,6 +58,15 @@ def git(*words, folder="."):
     return done.stdout.strip()
 
 
+def checked_out(folder):
+    """The commit in a folder, "+" behind it where files differ; "" without a history."""
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no", folder=folder)
+        return git("rev-parse", "HEAD", folder=folder) + ("+" if changed else "")
+    except SealError:
+        return ""
+
+
 def publishing_commit(path):
     """Hash of the commit that published a file of seals, which must stand there unchanged since.
 
