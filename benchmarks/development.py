@@ -40,7 +40,8 @@ from diagnosis.trials.tools import run_tool  # noqa: E402
 
 COLUMNS = (
     "trial kind joints touches level hidden over_noise verdict said exit needed found first strict "
-    "false unknown_placed prediction error_before error_after error_floor seconds steps version note"
+    "false unknown_placed prediction error_before error_after error_floor seconds steps version "
+    "note"
 ).split()
 KINDS = ("null", "single", "unknown", "pair", "many")
 DIAGNOSE = (
