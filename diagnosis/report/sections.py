@@ -252,6 +252,13 @@ def _advice(diagnosis):
 def _about(diagnosis):
     summary = diagnosis.summary
     noise = (f"{text.channel_words(n)} {text.number(v, 2)}" for n, v in summary["noise"].items())
+    others = []
+    if getattr(diagnosis, "corrected_py", ""):
+        others.append(("corrected.py", "what MJCF cannot hold, beside a step of corrected.xml"))
+    if unknown_curves(diagnosis):
+        others.append(("unknown_<n>.csv", "a force without a name, as a curve"))
+    if isinstance(summary.get("missing_force"), dict) and force.courses(diagnosis):
+        others.append(("force_<joint>.csv", "the missing force"))
     body = render(
         "about.html",
         train=_names(diagnosis.train),
@@ -259,7 +266,7 @@ def _about(diagnosis):
         noise=", ".join(noise),
         warnings=summary.get("warnings", []),
         reads=reads_files(diagnosis.corrected_xml),
-        curves=unknown_curves(diagnosis),
+        others=others,
     )
     return Section("The recordings", body)
 
