@@ -297,13 +297,16 @@ class Lag(ActuatorEffect):
         return replace(signal, lag=values[0])
 
     def write(self, spec, model, i, values):
-        actuator, seconds = self.general(spec, model, i), values[0]
-        if runge_kutta(model):
-            set_lag(actuator, seconds, model)
-            refine(spec, seconds)  # explodes on a filter faster than a step
-        else:
-            set_lag(actuator, end_of_step(seconds, spec.option.timestep), model)
+        seconds, step = values[0], spec.option.timestep
+        if runge_kutta(model) and seconds < step:  # explodes on a filter faster than a step
+            return "python" if seconds else "mjcf"
+        if not runge_kutta(model):
+            seconds = end_of_step(seconds, step)
+        set_lag(self.general(spec, model, i), seconds, model)
         return "mjcf"
+
+    def part(self, model, i, values):
+        return Part("lag", model.actuator(i).name, {"seconds": float(values[0])})
 
 
 @catalogue

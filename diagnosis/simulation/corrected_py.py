@@ -56,7 +56,8 @@ def python_parts(model, setting, written=None):
             i = candidate.effect.id(model, candidate.place.name)
             part = candidate.effect.part(model, i, values)
             parts += [part] if isinstance(part, Part) else list(part or ())
-    return sorted(parts, key=lambda part: part.law == "delay")  # of what the others leave
+    late = {"delay": 1, "lag": 2}  # of what the others leave
+    return sorted(parts, key=lambda part: late.get(part.law, 0))
 
 
 def xml_holds(written):

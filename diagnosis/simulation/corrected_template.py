@@ -233,6 +233,16 @@ def rate_limit(look, wanted, memory, rate):
     return value + np.sign(gap) * (rate * reached**2 / 2 + abs(gap) * (h - reached)) / h
 
 
+def lag(look, wanted, memory, seconds):
+    """The control passes a first-order filter: its mean over the step to come."""
+    goal, value, since = memory.get("lag", (wanted, wanted, look.time))
+    value = goal + (value - goal) * np.exp(-np.maximum(look.time - since, 0.0) / seconds)
+    value = np.where(look.time < since, wanted, value)  # another run
+    memory["lag"] = np.copy(wanted), value, np.copy(look.time)
+    gone = -np.expm1(-look.step / seconds)
+    return wanted + seconds / look.step * gone * (value - wanted)
+
+
 def delay(look, wanted, memory, seconds):
     """The control comes later by less than a step: its mean over the step to come."""
     before, since = memory.get("delay", (wanted, look.time))
@@ -253,7 +263,7 @@ def effort_fade(look, wanted, memory, tires):
 FRICTION = {f.__name__: f for f in (stribeck_rest, load_friction, friction_wave, friction_curve)}
 FORCE = {f.__name__: f for f in (curve, wave, surface, stribeck_release)}
 DRIVE = {f.__name__: f for f in (dead_zone_of_force, torque_speed, gain_fade)}
-CONTROL = {f.__name__: f for f in (dead_zone, rate_limit, effort_fade, delay)}
+CONTROL = {f.__name__: f for f in (dead_zone, rate_limit, effort_fade, delay, lag)}
 
 
 # running

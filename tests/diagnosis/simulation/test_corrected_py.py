@@ -95,6 +95,8 @@ def test_the_script_is_the_simulator(tmp_path, kind):
         if candidate.effect.name in OF_DRIVES:
             named.append({candidate: SIZES[candidate.effect.name]})
     named.append({world.candidate("delay", "bend"): (0.0007,)})  # less than a step
+    if kind == "rk4":
+        named.append({world.candidate("lag", "bend"): (0.0012,)})
     settings = named + (curves(world) if kind != "rk4" else [])
     nominal = simulate(world, [{}], recording, ROWS)[0]
     for setting, expected in zip(settings, simulate(world, settings, recording, ROWS)):
