@@ -191,6 +191,9 @@ def main(argv=None):
     except (EnvError, RunError, OSError, KeyError, csv.Error) as error:
         print(f"reproduce.py: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("\nstopped; the same command goes on", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ import torch
 
 from envs import BatchEnv, EnvError, model_path, parse_perturbation
 from models import GaussianPolicy
-from rgat import identity, one_step_error
-from training.physics_grounding import Physics, recordings_of
-from trpo import Transitions, rollouts
+from rgat import RGAT, GroundingSettings, Solved, identity, one_step_error
+from training.physics_grounding import Physics, PhysicsThen, recordings_of
+from trpo import Transitions, TRPOConfig, rollouts
 
 torch.set_num_threads(1)
 
@@ -100,3 +100,35 @@ def test_too_little_to_diagnose_is_said_in_a_line():
     tau = transitions(sim, 1)[:3]
     with pytest.raises(EnvError, match="no diagnosis from 3 real transitions"):
         Physics(sim).fit(tau, 0)
+
+
+@pytest.mark.parametrize("rest", [RGAT, Solved])
+def test_a_transformer_takes_what_the_diagnosis_leaves(rest, monkeypatch):
+    """The diagnosis finds a part of the mass; the rest has the corrected simulator to work on."""
+    sim = BatchEnv("InvertedPendulum-v4", 4, nthread=1)
+    real = BatchEnv("InvertedPendulum-v4", 4, parse_perturbation("pole:mass=20"), nthread=1)
+    tau, held_out = transitions(real, 8), transitions(real, 4, seed=1)
+    settings = GroundingSettings(at=TRPOConfig(batch_size=64, gamma=0.0), at_std=0.05)
+    grounding, policy = PhysicsThen(rest, sim, settings), GaussianPolicy(4, 1)
+    for mass in (12, 13):
+        monkeypatch.setattr(
+            "training.physics_grounding.diagnose",
+            lambda path, recordings: SimpleNamespace(corrected_xml=with_pole(mass, 0)),
+        )
+        before = getattr(grounding.rest, "learner", None)
+        before = before and [p.detach().clone() for p in before.policy.net.parameters()]
+        grounding.fit(tau, 0)
+        if before and mass == 13:  # g_phi goes on in the new simulator
+            now = grounding.rest.learner.policy.net.parameters()
+            assert all(torch.equal(a, b) for a, b in zip(before, now))
+        grounding.update(policy, 1000, 0)
+        assert grounding.sim is grounding.rest.sim
+        assert grounding.sim.model.body("pole").mass[0] == pytest.approx(mass)
+    corrected = one_step_error(grounding.sim, identity, held_out)[0]
+    assert corrected < one_step_error(sim, identity, held_out)[0]
+    if rest is Solved:
+        assert one_step_error(grounding.sim, grounding.transformer, held_out)[0] < 0.5 * corrected
+    again = PhysicsThen(rest, sim, settings)
+    again.load(grounding.state())
+    ours, theirs = (one_step_error(g.sim, g.transformer, held_out) for g in (grounding, again))
+    assert ours == theirs
