@@ -10,6 +10,7 @@ import argparse
 import copy
 import dataclasses
 import hashlib
+import importlib.util
 import json
 import sys
 from functools import partial
@@ -448,6 +449,8 @@ def parse(argv):
             f"--{given[0].replace('_', '-')} cannot be changed: a run goes on in its folder with the settings it began with "
             "(but for more --grounding-steps); leave it out"
         )
+    if args.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        raise RunError("--tensorboard needs TensorBoard: pip install tensorboard")
     if args.resume and args.replay:
         raise RunError("--resume and --replay are two things to do: give one of them")
     return args

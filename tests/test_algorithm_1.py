@@ -167,6 +167,20 @@ def test_g_phi_gets_its_steps_and_is_judged_on_what_nothing_is_fitted_on(spied):
         ]
 
 
+def test_a_shared_first_policy_is_known_by_what_made_it(spied, tmp_path):
+    """Two policies a run, sim's and real's; threads count, although they should not matter."""
+    shared = tmp_path / "shared"
+    names = lambda: {path.name for path in shared.glob("*.pt")}
+    spied(pretrained=str(shared), threads=1)
+    first = names()
+    spied(pretrained=str(shared), threads=1, at_steps=AT + 1, real_trajectories=1)
+    assert names() == first and len(first) == 2
+    for change in ({"threads": 2}, {"seed": 8}, {"num_envs": 2}, {"preset": "paper"}):
+        before = names()
+        spied(**{"pretrained": str(shared), "threads": 1, **change})
+        assert len(names()) == len(before) + 2
+
+
 def test_seeds_differ_between_uses_steps_and_runs():
     seeds = {train.seed_for(s, step, p) for s in (0, 1) for step in range(4) for p in PURPOSES}
     assert len(seeds) == 2 * 4 * len(PURPOSES) and max(seeds) < 2**31

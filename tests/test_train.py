@@ -328,6 +328,12 @@ def test_tensorboard_on_request(tmp_path, capfd, monkeypatch):
         def add_scalar(self, name, value, x):
             scalars.append((name, value, x))
 
+    find = train.importlib.util.find_spec
+    missing = lambda name: None if name == "tensorboard" else find(name)
+    monkeypatch.setattr(train.importlib.util, "find_spec", missing)
+    refused(command(tmp_path / "run", "sim", ENV, "--tensorboard"), capfd, "pip install")
+    assert not (tmp_path / "run").exists()
+    monkeypatch.setattr(train.importlib.util, "find_spec", lambda name: find("json"))
     monkeypatch.setattr(train, "tensorboard", lambda folder: Board())
     told = ["--grounding-steps", "1", "--tensorboard"]
     assert train.main(command(tmp_path / "run", "sim", ENV, *told)) == 0

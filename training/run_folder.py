@@ -259,11 +259,9 @@ class Run:
 
 
 def tensorboard(folder):
-    """A writer of TensorBoard's event files. Raises RunError where TensorBoard is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise RunError("--tensorboard needs TensorBoard: pip install tensorboard") from None
+    """A writer of TensorBoard's event files; only where TensorBoard is installed."""
+    from torch.utils.tensorboard import SummaryWriter
+
     return SummaryWriter(str(folder))
 
 
