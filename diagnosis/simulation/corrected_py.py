@@ -204,7 +204,12 @@ def module_of(parts, joints=()):
 
 
 def parts_in(text):
-    """The Parts of a corrected.py, read from its text without running it. Raises ScriptError."""
+    """The Parts of a corrected.py, read from its text without running it; [] of no text.
+
+    Raises ScriptError.
+    """
+    if not text:
+        return []
     try:
         (value,) = (
             ast.literal_eval(node.value)

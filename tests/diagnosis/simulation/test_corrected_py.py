@@ -283,6 +283,7 @@ def test_a_batch_without_parts_is_mujocos():
         batch.bind("qvel")[:] = START[1]
         batch.step(nstep=20)
     np.testing.assert_array_equal(*(batch.state for batch in batches))
+    assert parts_in("") == []
     with pytest.raises(ScriptError, match="no PARTS"):
         parts_in("import os")
 
