@@ -1,9 +1,11 @@
-"""A robot to try the tool on as a newcomer has it: arm.urdf, and four ROS 2 bags of its joint states.
+"""A robot to try the tool on as a newcomer has it: arm.urdf, and four ROS 2 bags of its joint
+states.
 
     python benchmarks/newcomer.py demo
 
-The arm has two joints with motors. Its bags hold positions (an encoder of 16384 counts a turn, no velocities) and the torques
-of its motors, as `effort`, at 100 Hz for 8 s. What the URDF lacks is in HIDDEN; the bags are drawn by stock MuJoCo.
+The arm has two joints with motors. Its bags hold positions (an encoder of 16384 counts a turn, no
+velocities) and the torques of its motors, as `effort`, at 100 Hz for 8 s. What the URDF lacks is in
+HIDDEN; the bags are drawn by stock MuJoCo.
 """
 
 import argparse

@@ -107,7 +107,8 @@ def arm(kind):
 
 
 def commanded(time, ctrl=None, joints=1, name="made-up"):
-    """A Recording of controls (T, nu), or of none, without measurements: what a simulation needs of one."""
+    """A Recording of controls (T, nu), or of none, without measurements: what a simulation needs of
+    one."""
     unread = np.full((len(time), joints), np.nan)
     return Recording(name, time, unread, unread, np.empty((len(time), 0)) if ctrl is None else ctrl)
 
@@ -178,7 +179,8 @@ DROP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="
 
 
 def dropped(seed, damping):
-    """A block falls from somewhere, bounces and lies still, in stock MuJoCo: few rows hold what its contact is like."""
+    """A block falls from somewhere, bounces and lies still, in stock MuJoCo: few rows hold what its
+    contact is like."""
     rng, model = (
         np.random.default_rng(seed),
         mujoco.MjModel.from_xml_string(DROP.format(damping=damping)),
@@ -207,7 +209,8 @@ NOISE = 5e-4
 
 
 def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=NOISE, finer=1):
-    """A run of the pendulum in stock MuJoCo: sines and steps, position measured every 10 ms with noise.
+    """A run of the pendulum in stock MuJoCo: sines and steps, position measured every 10 ms with
+    noise.
 
     push(time, qpos, qvel): torque that no catalogue knows of.
     """

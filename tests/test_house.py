@@ -1,7 +1,8 @@
 """The house: imports run downward only, and what is written fits on a screen.
 
-`tests/house_debt.csv` lists the files that have lines of more than 100 columns, and the functions of
-more than 50 lines, from before these rules. It shrinks: who mends one takes it off, nobody adds any.
+`tests/house_debt.csv` lists the files that have lines of more than 100 columns, and the functions
+of more than 50 lines, from before these rules. It shrinks: who mends one takes it off, nobody adds
+any.
 """
 
 import ast
@@ -42,7 +43,8 @@ def sources():
 
 
 def room_of(path):
-    """The package below `diagnosis`, the folder, or the module at the root that a file belongs to."""
+    """The package below `diagnosis`, the folder, or the module at the root that a file belongs
+    to."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     if parts[0] == "diagnosis":
         return ".".join(parts[:2])
@@ -110,7 +112,8 @@ def test_trials_share_no_physics_with_what_they_judge():
 
 
 def measured():
-    """{(file, "columns"): lines that are too long} and {(file, function): its lines, if too many}."""
+    """{(file, "columns"): lines that are too long} and {(file, function): its lines, if too
+    many}."""
     found = {}
     for path in sources():
         text, name = path.read_text(encoding="utf-8"), str(path.relative_to(ROOT))

@@ -50,7 +50,8 @@ def write_together(files):
         if not isinstance(error, OSError):
             raise
         raise WriteError(
-            f"cannot write {path}: {error.strerror or error}; free some space or choose another folder"
+            f"cannot write {path}: {error.strerror or error}; free some space or choose another "
+            "folder"
         ) from None
 
 

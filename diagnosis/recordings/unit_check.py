@@ -1,7 +1,9 @@
-"""Does a recording make sense to the model in another unit, turned round, or with columns exchanged, and only then?
+"""Does a recording make sense to the model in another unit, turned round, or with columns
+exchanged, and only then?
 
-The test is Newton's second law, M(q) a = F(q, v, ctrl), on smoothed positions. A mistake of unit (57 times, 1000 times),
-of sign or of column leaves the two sides unrelated, whatever small physics the model lacks; the right reading relates them.
+The test is Newton's second law, M(q) a = F(q, v, ctrl), on smoothed positions. A mistake of unit
+(57 times, 1000 times), of sign or of column leaves the two sides unrelated, whatever small physics
+the model lacks; the right reading relates them.
 """
 
 from dataclasses import replace
@@ -19,19 +21,23 @@ HALVES = (
     inverse_dynamics.HALF,
     4 * inverse_dynamics.HALF,
 )  # s, of the smoothing: for fast motion, and for slow motion under much noise
-UNLIKE = 0.35  # imbalance (0: the law holds, 1: one side dwarfs the other) above which a reading can be wrong;
+# imbalance (0: the law holds, 1: one side dwarfs the other) above which a reading can be wrong;
+UNLIKE = 0.35
 UNIT_GAIN, SWAP_GAIN, LIKE = (
     2,
     3,
     0.1,
 )  # the right one divides it by so much, and leaves or makes it small in the other dofs
 # (missing friction alone reaches 0.7, but no wrong reading betters that so)
-WIDE = 3.0  # degrees or mm: who records a joint in these moves it farther; one that sticks would look like one in degrees
+# degrees or mm: who records a joint in these moves it farther; one that sticks would look like one
+# in degrees
+WIDE = 3.0
 FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 
 class Reading(NamedTuple):
-    """Another way to read a recording: what to tell, the dofs whose imbalance must fall, by how much, and the states."""
+    """Another way to read a recording: what to tell, the dofs whose imbalance must fall, by how
+    much, and the states."""
 
     message: str
     dofs: list
@@ -40,8 +46,8 @@ class Reading(NamedTuple):
 
 
 def suspect(recording, model):
-    """One line that says which unit, sign or columns seem wrong, or None. Silent for models with actuator states or joints
-    that were not measured, and where contacts act."""
+    """One line that says which unit, sign or columns seem wrong, or None. Silent for models with
+    actuator states or joints that were not measured, and where contacts act."""
     if model.na or model.nq == 0 or np.isnan(recording.qpos).all(axis=0).any():
         return None
     for half in HALVES:
@@ -199,7 +205,8 @@ def _readings(recording, model, states, half):
 
 
 def _moments(model):
-    """(nu, nv) moment arms in the reference pose of the actuator behind each control; small ones count as none."""
+    """(nu, nv) moment arms in the reference pose of the actuator behind each control; small ones
+    count as none."""
     data, out = mujoco.MjData(model), np.zeros((model.nu, model.nv))
     mujoco.mj_forward(model, data)
     for a in range(model.nactuator):
@@ -215,7 +222,8 @@ def _moments(model):
 
 
 def _scaled(model, states, factors):
-    """The states with the positions of joints times {joint: factor}; of a free joint, those of its origin."""
+    """The states with the positions of joints times {joint: factor}; of a free joint, those of its
+    origin."""
     qpos, qvel, qacc, ctrl = (x.copy() for x in states)
     for j, factor in factors.items():
         for x, first in (
@@ -228,7 +236,8 @@ def _scaled(model, states, factors):
 
 
 def _imbalance(model, qpos, qvel, qacc, ctrl):
-    """(nv,) rms(M a - F) / (rms(M a) + rms(F)) over the rows without contact; nan where those are few."""
+    """(nv,) rms(M a - F) / (rms(M a) + rms(F)) over the rows without contact; nan where those are
+    few."""
     data = mujoco.MjData(model)
     inertial, force, product = [], [], np.zeros(model.nv)
     for q, v, a, u in zip(qpos, qvel, qacc, ctrl):

@@ -25,7 +25,8 @@ SHOTS = 5  # corrections of a start that delayed sensors show late
 
 
 class Engine:
-    """Simulator for settings with the same structure, a frozenset of the candidates that need parts of their own."""
+    """Simulator for settings with the same structure, a frozenset of the candidates that need parts
+    of their own."""
 
     def __init__(self, spec, nominal, structure):
         self.working, self.nominal = Working(spec, nominal, structure), nominal
@@ -46,11 +47,13 @@ class Engine:
     def run(self, cases, start_qpos, start_qvel, windows, rows, step, count, sensors):
         """World.simulate for n simulations that share structure, time step and way of stepping.
 
-        Returns qpos (n, rows, nq), qvel (n, rows, nv) and, if `sensors`, sensordata (n, rows, nsensordata).
+        Returns qpos (n, rows, nq), qvel (n, rows, nv) and, if `sensors`, sensordata (n, rows,
+        nsensordata).
         """
         measures, sensor_measures = self._measures(cases)
         (offset, ratio, delay), recordings = measures, [w.recording for w in windows]
-        # a window begins as long before its first row as its latest sensor is late, but not before the recording
+        # a window begins as long before its first row as its latest sensor is late, but not before
+        # the recording
         early = np.maximum(
             delay.max(axis=1, initial=0.0), sensors * sensor_measures[2].max(axis=1, initial=0.0)
         )
@@ -117,7 +120,8 @@ class Engine:
         return qpos, qvel
 
     def _run_up(self, cases, windows, begin, measures, step):
-        """States (n, ·) of the working model at `begin`, activations included, for what the recording does not show of them.
+        """States (n, ·) of the working model at `begin`, activations included, for what the
+        recording does not show of them.
 
         From RUN_UP seconds before, always again from what was recorded, with the hidden
         coordinates running on; at rest in the middle where nothing was recorded.
@@ -146,11 +150,12 @@ class Engine:
     def _trajectory(
         self, cases, recordings, begin, qpos, qvel, step, count, sensors=False, act=None
     ):
-        """Every step from states qpos (n, nq), qvel (n, nv) of the working model at times `begin` (n,).
+        """Every step from states qpos (n, nq), qvel (n, nv) of the working model at times `begin`
+        (n,).
 
-        act (n, na): activations, of which those count that the nominal model lacks; zero if not given.
-        Returns q (n, 1 + count, nq), v (n, 1 + count, nv), sensordata (n, 1 + count, ·) or None, act
-        (n, 1 + count, na); NaN after the first state of a simulation that failed.
+        act (n, na): activations, of which those count that the nominal model lacks; zero if not
+        given. Returns q (n, 1 + count, nq), v (n, 1 + count, nv), sensordata (n, 1 + count, ·) or
+        None, act (n, 1 + count, na); NaN after the first state of a simulation that failed.
         """
         n, memo, drive = len(cases), {}, self.working.drive
         on = [drive(c.on, r, t, step, count, memo) for c, r, t in zip(cases, recordings, begin)]
@@ -213,7 +218,8 @@ class Engine:
         return failed
 
     def _step(self, batch, cases, recordings, on, off, begin, step, out):
-        """As _rollout, with forces that depend on the state and conditions looked at before each step."""
+        """As _rollout, with forces that depend on the state and conditions looked at before each
+        step."""
         n, failed = len(cases), np.zeros(len(cases), bool)
         ids, spare = np.arange(n), [self.model] * (batch.nsim - n)
         live = {
@@ -282,7 +288,8 @@ class Engine:
         return failed
 
     def _functions(self, drives, method):
-        """[(members, function)] of the state-dependent "force" or friction "limit" of simulations."""
+        """[(members, function)] of the state-dependent "force" or friction "limit" of
+        simulations."""
         groups = {}
         for s, drive in enumerate(drives):
             for candidate, values in drive.items:
@@ -321,7 +328,8 @@ class Engine:
 
 
 def threads():
-    """Threads to run on: OMP_NUM_THREADS, where that is set as for other numerical libraries, else all CPUs (0)."""
+    """Threads to run on: OMP_NUM_THREADS, where that is set as for other numerical libraries, else
+    all CPUs (0)."""
     number = os.environ.get("OMP_NUM_THREADS", "")
     return int(number) if number.isdigit() else 0
 
@@ -333,7 +341,8 @@ def simple(model):
 
 
 def recorded_state(model, recording, t):
-    """qpos (nq,) and qvel (nv,) at the row nearest to time t: velocities as measured, else over the rows around it."""
+    """qpos (nq,) and qvel (nv,) at the row nearest to time t: velocities as measured, else over the
+    rows around it."""
     row = int(np.argmin(abs(recording.time - t)))
     a, b, qvel = max(row - 1, 0), min(row + 1, len(recording.time) - 1), np.full(model.nv, np.nan)
     if b > a:

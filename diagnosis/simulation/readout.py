@@ -9,7 +9,8 @@ FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 
 def read(model, q, v, time, step, delay):
-    """qpos (n, rows, nq), qvel (n, rows, nv) at times (n, rows) after the first state; NaN where time is.
+    """qpos (n, rows, nq), qvel (n, rows, nv) at times (n, rows) after the first state; NaN where
+    time is.
 
     q (n, 1 + count, nq), v: the trajectory at every step. Between steps, positions follow the
     cubic through positions and velocities, velocities the line, quaternions the normalized line.
@@ -43,7 +44,8 @@ def read(model, q, v, time, step, delay):
 
 
 def locate(x, length):
-    """Simulation, step and fraction of a step (0 within SLACK of a step), in x's shape, of times x (n, ...) in steps."""
+    """Simulation, step and fraction of a step (0 within SLACK of a step), in x's shape, of times x
+    (n, ...) in steps."""
     x = np.nan_to_num(x)
     k = np.clip(np.floor(x + SLACK).astype(int), 0, length - 1)
     fraction = np.where(abs(x - k) <= 1.5 * SLACK, 0.0, x - k)
@@ -52,7 +54,8 @@ def locate(x, length):
 
 
 def _cubic(q, v, s, k, f, step):
-    """Cubic Hermite of positions q and velocities v (n, 1 + count) at fraction f between steps k and k + 1."""
+    """Cubic Hermite of positions q and velocities v (n, 1 + count) at fraction f between steps k
+    and k + 1."""
     after = np.minimum(k + 1, q.shape[1] - 1)
     q0, q1, v0, v1 = q[s, k], q[s, after], v[s, k] * step, v[s, after] * step
     return q0 + f * v0 + f**2 * (3 * (q1 - q0) - 2 * v0 - v1) + f**3 * (2 * (q0 - q1) + v0 + v1)

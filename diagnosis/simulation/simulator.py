@@ -85,7 +85,8 @@ class World:
                     Candidate(effect, Place(effect.kind, name), tuple(parameters))
                 )
         self._engines = {}
-        self.fits = {}  # of start states, that shooting remembers for as long as this world is looked at
+        # of start states, that shooting remembers for as long as this world is looked at
+        self.fits = {}
 
     @classmethod
     def load(cls, path):
@@ -119,15 +120,17 @@ class World:
         return cls.load(path)
 
     def candidate(self, effect, place):
-        """The Candidate of an effect and a place, by their names; KeyError if it cannot sit there."""
+        """The Candidate of an effect and a place, by their names; KeyError if it cannot sit
+        there."""
         for candidate in self.candidates:
             if (candidate.effect.name, candidate.place.name) == (effect, place):
                 return candidate
         raise KeyError(f"{effect} cannot sit at {place}")
 
     def curve(self, joint, variable, knots, factor=None, wave=False):
-        """Candidate `unknown`: a force in a joint as a curve of 'position:<joint>', 'velocity:<joint>',
-        'control:<actuator>' or 'time', linear between knots; its parameters are the forces at the knots. See curves.Unknown."""
+        """Candidate `unknown`: a force in a joint as a curve of 'position:<joint>',
+        'velocity:<joint>', 'control:<actuator>' or 'time', linear between knots; its parameters are
+        the forces at the knots. See curves.Unknown."""
         return unmodelled.curve(self.model, joint, variable, knots, factor, wave)
 
     def localised(self, candidate, when):
@@ -135,7 +138,8 @@ class World:
         return replace(candidate, when=when)
 
     def probes(self, candidate, recordings):
-        """Values (P, parameters) worth a first try, for effects whose nominal value has no gradient too."""
+        """Values (P, parameters) worth a first try, for effects whose nominal value has no gradient
+        too."""
         return candidate.effect.probes(
             self.model, candidate.effect.id(self.model, candidate.place.name), recordings
         )
@@ -155,7 +159,8 @@ class World:
         )
 
     def related(self, candidate):
-        """Candidates at the same joints in whose wrong values this one may hide, or theirs in its."""
+        """Candidates at the same joints in whose wrong values this one may hide, or theirs in
+        its."""
         mine, out = self.joints(candidate.place), []
         for other in self.candidates:
             theirs = self.joints(other.place)
@@ -294,8 +299,9 @@ class World:
 
 
 class Case:
-    """One setting, resolved: `on` [(candidate, values)] in the order of the catalogue, without those at their
-    nominal values; `off` those that act without a condition; `when` the condition of the others, if any."""
+    """One setting, resolved: `on` [(candidate, values)] in the order of the catalogue, without
+    those at their nominal values; `off` those that act without a condition; `when` the condition of
+    the others, if any."""
 
     def __init__(self, model, setting, refine):
         order = {effect: k for k, effect in enumerate(EFFECTS)}

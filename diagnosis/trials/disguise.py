@@ -60,7 +60,8 @@ def disguise(nominal, true, items, runs, noise):
 
 
 def _fields(robot, items):
-    """[(link index, "mass" or "damping")] to fit: at the items' places, not the items themselves."""
+    """[(link index, "mass" or "damping")] to fit: at the items' places, not the items
+    themselves."""
     hidden = {(item.effect, item.place["name"]) for item in items}
     fields = []
     for index, link in enumerate(robot.links):

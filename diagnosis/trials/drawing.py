@@ -58,7 +58,8 @@ class Trial:
         return TrueSystem(self.true, self.laws)
 
     def without(self, index):
-        """(TrueSystem, kept laws' indices): the true machine with item `index` as in the nominal."""
+        """(TrueSystem, kept laws' indices): the true machine with item `index` as in the
+        nominal."""
         kept = [k for k, owner in enumerate(self.owners) if owner != index]
         true = self.nominal
         for k, change in enumerate(self.changes):

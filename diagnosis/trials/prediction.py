@@ -12,7 +12,8 @@ HORIZON = 0.3  # s
 
 
 def windows(time, horizon=HORIZON):
-    """[(first row, last row)] of consecutive windows; one ends where the next begins; a stump is dropped."""
+    """[(first row, last row)] of consecutive windows; one ends where the next begins; a stump is
+    dropped."""
     found, first = [], 0
     while True:
         last = int(np.searchsorted(time, time[first] + horizon * (1 + 1e-9), side="right")) - 1

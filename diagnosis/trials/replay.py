@@ -1,4 +1,5 @@
-"""The Error of what a tool wrote, in a process of its own that knows the held-out rows and no answer.
+"""The Error of what a tool wrote, in a process of its own that knows the held-out rows and no
+answer.
 
     python -m diagnosis.trials.replay sim.xml report held_out.npz      # prints {"error": 2.31}
 
@@ -47,7 +48,8 @@ def load_runs(path):
 
 
 def replay(model, report, held_out):
-    """The Error of report/corrected.xml (and .py), measured in a process of its own; inf if it fails."""
+    """The Error of report/corrected.xml (and .py), measured in a process of its own; inf if it
+    fails."""
     command = [sys.executable, "-m", "diagnosis.trials.replay", model, report, held_out]
     try:
         done = subprocess.run(

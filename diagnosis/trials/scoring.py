@@ -129,7 +129,8 @@ def score_findings(answer, findings, seen=None):
 
 
 def assign(hidden, findings):
-    """{hidden index: finding index}: one to one, as many first names as possible, then listed ones."""
+    """{hidden index: finding index}: one to one, as many first names as possible, then listed
+    ones."""
     if not hidden or not findings:
         return {}
     worth = np.zeros((len(hidden), len(findings)))
@@ -175,7 +176,8 @@ def _finer(finding):
 
 
 def beside(place, item):
-    """Is a finding's place the item's own joint, link or drive (one number), or one of them the world?"""
+    """Is a finding's place the item's own joint, link or drive (one number), or one of them the
+    world?"""
     numbers = lambda p: set(re.findall(r"\d+", str(p["name"])))
     here, there = numbers(place), numbers(item["place"])
     return not here or not there or bool(here & there)

@@ -87,7 +87,8 @@ def run_trial(task, template, limit=900):
 
 
 def judged(answer, summary):
-    """The columns that say what a diagnosis.json (None: there is none) is worth against an answer."""
+    """The columns that say what a diagnosis.json (None: there is none) is worth against an
+    answer."""
     try:
         score = score_findings(answer, summary["findings"] if summary else [])
         findings = summary["findings"] if summary else []
@@ -192,7 +193,8 @@ def on_cores(tasks, template, limit, jobs):
 
 
 def on_ray(tasks, template, limit, address):
-    """Rows as they come, from a Ray cluster; what a lost node had begun is begun again elsewhere."""
+    """Rows as they come, from a Ray cluster; what a lost node had begun is begun again
+    elsewhere."""
     import ray
 
     root = str(Path(__file__).resolve().parents[2])

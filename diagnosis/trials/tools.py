@@ -1,4 +1,5 @@
-"""Running whatever tool is entered, as a user would: its own process, a bare environment, one folder.
+"""Running whatever tool is entered, as a user would: its own process, a bare environment, one
+folder.
 
 answer = run_tool("python diagnose.py --model {model} --recordings {recordings} --out {out}",
                   folder, ["train_0.csv"], limit=900)

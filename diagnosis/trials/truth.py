@@ -115,7 +115,8 @@ class TrueSystem:
             self._substep()
 
     def _substep(self):
-        """v' = v + dt (3 a_n - a_(n-1))/2, q' = q + dt (v + v')/2; friction and contacts by Euler."""
+        """v' = v + dt (3 a_n - a_(n-1))/2, q' = q + dt (v + v')/2; friction and contacts by
+        Euler."""
         model, data = self.model, self.data
         mujoco.mj_step1(model, data)
         self._look()

@@ -310,7 +310,8 @@ def test_what_is_written_of_a_curve_stays_near_it():
 
 
 def test_inertias_that_were_seen_are_written_as_they_are():
-    """The triangle inequality moves what did not show; where all did and none is a body's, nothing is written."""
+    """The triangle inequality moves what did not show; where all did and none is a body's, nothing
+    is written."""
     world = World(mujoco.MjSpec.from_string(BODY))
     candidate = world.candidate("inertia", "b")
     effect, nominal = candidate.effect, candidate.nominal
@@ -331,7 +332,8 @@ def test_inertias_that_were_seen_are_written_as_they_are():
 
 
 def test_what_does_not_show_goes_back():
-    """An unseen moment that a fit drove away returns, as near to its nominal value as the seen one allows."""
+    """An unseen moment that a fit drove away returns, as near to its nominal value as the seen one
+    allows."""
     world = World(mujoco.MjSpec.from_string(BODY))
     candidate = world.candidate("inertia", "b")
     effect, i, nominal = candidate.effect, world.model.body("b").id, candidate.nominal

@@ -1,4 +1,5 @@
-"""The model's own sensors: errors against a plain loop in stock MuJoCo, faults that were put in, and none where none are."""
+"""The model's own sensors: errors against a plain loop in stock MuJoCo, faults that were put in,
+and none where none are."""
 
 from dataclasses import replace
 
@@ -20,7 +21,8 @@ NOISE = {"angle": 0.001, "spin": 0.01, "felt": 0.05, "where": 0.001, "force": 0.
 
 
 def run(seed, damping=0.05, seconds=6.0, fault=None):
-    """A run in stock MuJoCo, rows 10 ms apart, position and sensors with noise. fault(name, columns (T, k)): what a sensor shows instead."""
+    """A run in stock MuJoCo, rows 10 ms apart, position and sensors with noise. fault(name, columns
+    (T, k)): what a sensor shows instead."""
     rng, model = (
         np.random.default_rng(seed),
         mujoco.MjModel.from_xml_string(ARM.format(damping=damping)),

@@ -26,7 +26,8 @@ def case(request):
     lag=st.one_of(st.just(0.0), st.floats(1e-4, 0.1)),
 )
 def test_signal_against_a_plain_loop(seed, delay, lag):
-    """A held, delayed, filtered control, sampled in steps, against 1 µs steps of the differential equation."""
+    """A held, delayed, filtered control, sampled in steps, against 1 µs steps of the differential
+    equation."""
     rng = np.random.default_rng(seed)
     time, value = np.cumsum(rng.uniform(0.001, 0.02, 12)), rng.uniform(-1, 1, 12)
     start, step, count, fine = time[4], 0.002, 10, 1e-6
@@ -131,7 +132,8 @@ BALLS = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbod
     ],
 )
 def test_effects_of_a_ball_joint(effect, value, attribute):
-    """The same as the attribute in the file, and as the corrected file; the same in all directions."""
+    """The same as the attribute in the file, and as the corrected file; the same in all
+    directions."""
     world = World(mujoco.MjSpec.from_string(BALLS.format("")))
     recording = commanded(0.01 * np.arange(40))
     start = np.array([[0.9, 0.3, -0.3, np.sqrt(1 - 0.81 - 0.18)]]), np.array([[1.0, -2.0, 3.0]])
@@ -149,7 +151,8 @@ def test_effects_of_a_ball_joint(effect, value, attribute):
 
 
 def test_rows_between_time_steps():
-    """Irregular rows that no time step meets, against the closed form of an oscillator pushed at those rows."""
+    """Irregular rows that no time step meets, against the closed form of an oscillator pushed at
+    those rows."""
     xml = """<mujoco><option timestep="0.003" gravity="0 0 0" integrator="RK4"/><worldbody><body><joint name="x" type="slide" axis="1 0 0" stiffness="50"/>
              <geom size=".1" mass="2"/></body></worldbody><actuator><motor name="m" joint="x"/></actuator></mujoco>"""
     world, rng = World(mujoco.MjSpec.from_string(xml)), np.random.default_rng(0)
@@ -197,7 +200,8 @@ def test_sensors_of_the_joints(case):
     np.testing.assert_allclose(seen[:, 2], 1.2 * run[::10, 2] + 0.1, atol=1e-12)
     np.testing.assert_allclose(seen[:, :2], run[::10, :2], atol=1e-12)
 
-    # a late sensor, from the middle of the run: what it shows belongs to an earlier moment than the other joints' readings
+    # a late sensor, from the middle of the run: what it shows belongs to an earlier moment than the
+    # other joints' readings
     late = {
         world.candidate("sensor_delay", "elbow"): (0.0165,),
         world.candidate("sensor_delay", "swing"): (0.004,),
@@ -245,7 +249,8 @@ def test_sensors_of_the_model(case):
 
 
 def test_effects_under_a_condition():
-    """A load in the middle of the run, friction in part of the range: against a loop that switches them."""
+    """A load in the middle of the run, friction in part of the range: against a loop that switches
+    them."""
     world = pendulum()
     time = np.arange(80) * 0.01
     recording = commanded(time, 0.3 * np.sin(9 * time)[:, None], name="run")
@@ -367,7 +372,8 @@ CUBE = """
 
 
 def test_a_tossed_cube(case):
-    """Free joints and contacts: the same in MJCF; friction follows the larger of the two geoms' nominally."""
+    """Free joints and contacts: the same in MJCF; friction follows the larger of the two geoms'
+    nominally."""
     world = World(mujoco.MjSpec.from_string(CUBE))
     recording = commanded(np.arange(60) / 148)
     q, v = np.array([0, 0, 0.12, 1, 0, 0, 0.0]), np.array([1.0, 0.3, -1, 2, 1, 0])

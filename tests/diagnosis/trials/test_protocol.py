@@ -1,4 +1,5 @@
-"""Seals, run and audit in a repository of its own, with a tool that says nothing and one that lies."""
+"""Seals, run and audit in a repository of its own, with a tool that says nothing and one that
+lies."""
 
 import csv
 import json
