@@ -191,7 +191,7 @@ def row(arm, seed, step, value, v="v1", error=""):
 def test_pairs_are_of_seeds_that_both_have_over_rounds_that_both_have():
     rounds = [row("rgat", s, k, 10 * s + k) for s in (0, 1, 2) for k in range(4)]
     rounds += [row("gat", s, k, 10 * s - k) for s in (1, 2, 3) for k in range(3)]
-    data = claims.Data(rounds, [{"seed": 1, "trained_on_real": 10}])
+    data = claims.Data(rounds, [{"arm": "rgat", "seed": 1, "trained_on_real": 10}])
     np.testing.assert_allclose(claims.above("rgat", "gat")(data), [3.0, 3.0])  # 2 * mean(1, 2)
     np.testing.assert_allclose(claims.reaches("rgat")(data), [(13 - 9) / 10])
     np.testing.assert_allclose(claims.reaches("rgat", 1)(data), [(11 - 9) / 10])
@@ -205,7 +205,7 @@ def test_versions_are_never_put_together():
     ended = [{**r, "trained_on_real": 7.0 + (r["version"] == "v2")} for r in rounds]
     data = claims.by_experiment(rounds, ended)["hopper"]
     assert data.version == "v2" and len(data.returns["rgat"]) == 9
-    assert set(data.lines.values()) == {8.0}
+    assert set(data.line()) == {8.0}
     data = claims.by_experiment(rounds, ended[:4])["hopper"]  # what has not ended does not count
     assert data.version == "v1" and len(data.returns["rgat"]) == 3
 
@@ -218,5 +218,5 @@ def test_the_documents_tables_are_the_tables_of_the_csvs():
     kept = read(ROOT / "results" / "claims.csv")
     assert [{k: str(v) for k, v in r.items()} for r in made] == kept
     text = claims.DOCS.read_text()
-    assert claims.filled(text, rounds, judged, made) == text
+    assert claims.filled(text, rounds, judged, transformers, made) == text
     assert "<!-- claims -->" in text and "<!-- rounds -->" in text

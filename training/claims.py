@@ -1,7 +1,8 @@
 """The paper's claims against the rows that were measured: results/claims.csv, the figures, and docs/results.md's tables.
 
 Each claim is a number per seed, positive where the claim is so. Its test is a permutation test over seeds: under no
-effect each seed's number is as likely with the other sign. p is one-sided and corrected over all claims (Holm).
+effect each seed's number is as likely with the other sign. p is one-sided and corrected over all
+claims that have seeds enough to be tested (Holm).
 Rows of different versions are never put together: of each experiment the version with the most runs counts.
 """
 
@@ -22,6 +23,7 @@ from training.results import SAME, read
 COLUMNS = "claim figure statistic value low high seeds p p_corrected verdict choice version commit".split()
 COLORS = {"rgat": "#1f5fa8", "gat": "#d98b1f", "sim": "#c0392b", "real": "#2e8b57", "oracle": "#555555", "solved": "#0f8b8d", "rgat as printed": "#111111", "rgat, rolled back": "#7fb0e0"}  # fmt: skip
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "results.md"
+FEWEST = 5  # seeds of a claim that is tested: fewer cannot bring p below 0.05
 REACHED = 0.9  # of the line of a policy trained on real: what counts as reaching it
 
 
@@ -32,7 +34,8 @@ class Data:
     """The rows of one experiment and one version: returns (rounds,) by arm and seed, and reference lines by seed."""
 
     def __init__(self, rounds, judged):
-        self.returns, self.errors, self.lines = defaultdict(dict), defaultdict(dict), {}
+        self.returns, self.errors = defaultdict(dict), defaultdict(dict)
+        self.lines = defaultdict(dict)  # by arm too: a policy of other settings has its own line
         for row in sorted(rounds, key=lambda r: int(r["grounding_step"])):
             arm, seed = row["arm"], int(row["seed"])
             value = float(row["real_return_deterministic"])
@@ -40,7 +43,7 @@ class Data:
             error = float(row["at_one_step_error"] or "nan")
             self.errors[arm].setdefault(seed, []).append(error)
         for row in judged:
-            self.lines[int(row["seed"])] = float(row["trained_on_real"])
+            self.lines[row["arm"]][int(row["seed"])] = float(row["trained_on_real"])
         self.version = rounds[0]["version"] if rounds else ""
         self.commits = sorted({row["commit"] for row in rounds})
 
@@ -52,14 +55,17 @@ class Data:
         length = min(len(self.returns[arm][seed]) for arm in arms for seed in seeds)
         return [np.array([self.returns[arm][seed][:length] for seed in seeds]) for arm in arms], seeds  # fmt: skip
 
-    def line(self, seeds):
-        return np.array([self.lines[seed] for seed in seeds])
+    def line(self):
+        """The line of the figure and the table: that of the first arm that has one, (seeds,)."""
+        arms = ["rgat", *self.lines]
+        return np.array(next((list(self.lines[a].values()) for a in arms if self.lines[a]), []))
 
     def with_lines(self, arm):
         """Returns (seeds, rounds) of an arm and the reference lines (seeds,) of the seeds that have one."""
         [returns], seeds = self.paired(arm)
-        keep = [k for k, seed in enumerate(seeds) if seed in self.lines]
-        return returns[keep], self.line([seeds[k] for k in keep])
+        lines = self.lines[arm]
+        keep = [k for k, seed in enumerate(seeds) if seed in lines]
+        return returns[keep], np.array([lines[seeds[k]] for k in keep])
 
 
 def by_experiment(rounds, judged):
@@ -249,9 +255,9 @@ def holm(p):
 
 def verdict(high, p_corrected, n):
     """holds: shown; does not hold: the interval has no room for it; undecided: neither, or too few seeds."""
-    if n >= 5 and p_corrected < 0.05:
+    if n >= FEWEST and p_corrected < 0.05:
         return "holds"
-    return "does not hold" if n >= 5 and high <= 0 else "undecided"
+    return "does not hold" if n >= FEWEST and high <= 0 else "undecided"
 
 
 def table(rounds, judged, transformers):
@@ -266,15 +272,15 @@ def table(rounds, judged, transformers):
         if len(values):
             of = lambda column: " ".join(sorted({row[column] for row in rows}))
             tried.append((claim, values, of("version"), of("commit")))
-    corrected = holm([permutation_p(values) for _, values, _, _ in tried])
+    tested = [permutation_p(v) if len(v) >= FEWEST else float("nan") for _, v, _, _ in tried]
     out = []
-    for (claim, values, version, commit), p in zip(tried, corrected):
+    for (claim, values, version, commit), p, p_corrected in zip(tried, tested, holm(tested)):
         mean, low, high = interval(values)
-        numbers = {"value": mean, "low": low, "high": high, "p": permutation_p(values), "p_corrected": p}  # fmt: skip
+        numbers = {"value": mean, "low": low, "high": high, "p": p, "p_corrected": p_corrected}  # fmt: skip
         out.append({
             "claim": f"{claim.experiment}: {claim.text}", "figure": claim.figure, "statistic": claim.statistic,
             **{k: f"{v:.4g}" for k, v in numbers.items()}, "seeds": len(values),
-            "verdict": verdict(high, p, len(values)), "choice": claim.choice, "version": version, "commit": commit,
+            "verdict": verdict(high, p_corrected, len(values)), "choice": claim.choice, "version": version, "commit": commit,
         })  # fmt: skip
     return out
 
@@ -291,12 +297,17 @@ def report(results):
     if rounds:
         draw(by_experiment(rounds, judged), results / "rounds.png")
     if DOCS.exists() and results.resolve() == DOCS.parents[1] / "results":
-        write_whole(DOCS, filled(DOCS.read_text(), rounds, judged, rows))
+        write_whole(DOCS, filled(DOCS.read_text(), rounds, judged, transformers, rows))
 
 
-def filled(text, rounds, judged, claims):
+def filled(text, rounds, judged, transformers, claims):
     """docs/results.md with what stands between its markers made anew."""
-    for name, made in (("claims", claims_markdown(claims)), ("rounds", rounds_markdown(rounds, judged))):  # fmt: skip
+    made = {
+        "claims": claims_markdown(claims),
+        "rounds": rounds_markdown(rounds, judged),
+        "transformers": transformers_markdown(transformers),
+    }
+    for name, made in made.items():  # fmt: skip
         pattern = rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)"
         text = re.sub(pattern, lambda m: m[1] + made + m[2], text, flags=re.DOTALL)
     return text
@@ -322,16 +333,32 @@ def rounds_markdown(rounds, judged):
             cells = [pm(returns[:, k]) for k in (0, min(1, returns.shape[1] - 1), -1)]
             last = " ".join(f"{v:.0f}" for v in returns[:, -1])
             out.append(f"| {arm} | {len(seeds)} | {returns.shape[1] - 1} | {' | '.join(cells)} | {last} |")  # fmt: skip
-        if data.lines:
-            line = np.array(list(data.lines.values()))
+        line = data.line()
+        if len(line):
             out.append(f"| *trained on real* | {len(line)} | | | | {pm(line)} | {' '.join(f'{v:.0f}' for v in line)} |")  # fmt: skip
     return "\n".join(out) + "\n\n"
 
 
-def pm(values):
+def transformers_markdown(rows):
+    """What one grounding step makes of actions, mean ± standard error over seeds."""
+    groups = defaultdict(list)
+    for row in rows:
+        groups[row["world"], row["forward_model"], row["algo"]].append(row)
+    numbers = "rms_from_identity", "slope", "one_step_error"
+    lines = [
+        "| real pole | f_ψ | method | seeds | RMS from the identity | slope | one-step error |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for key, mine in groups.items():
+        cells = [pm(np.array([float(row[k]) for row in mine]), 3) for k in numbers]
+        lines.append(f"| {' | '.join(key)} | {len(mine)} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def pm(values, digits=0):
     """Mean ± standard error."""
-    se = f" ± {np.std(values, ddof=1) / np.sqrt(len(values)):.0f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.0f}{se}"
+    se = np.std(values, ddof=min(1, len(values) - 1)) / np.sqrt(len(values))
+    return f"{np.mean(values):.{digits}f}" + f" ± {se:.{digits}f}" * (len(values) > 1)
 
 
 def draw(experiments, path):
@@ -352,8 +379,8 @@ def draw(experiments, path):
             color = COLORS.get(arm, f"C{k % 10}")
             axes.plot(mean, color=color, marker="o", ms=3, label=f"{arm} ({len(seeds)})")
             axes.fill_between(range(len(mean)), mean - se, mean + se, color=color, alpha=0.2, lw=0)
-        if data.lines:
-            axes.axhline(np.mean(list(data.lines.values())), color="#2e8b57", ls="--", lw=1)
+        if len(data.line()):
+            axes.axhline(np.mean(data.line()), color="#2e8b57", ls="--", lw=1)
         axes.set(title=f"{name}; version {data.version}", xlabel="grounding step", ylabel="return on real")  # fmt: skip
         axes.title.set_fontsize(9)
         axes.xaxis.get_major_locator().set_params(integer=True)
