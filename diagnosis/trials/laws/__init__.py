@@ -1,0 +1,118 @@
+"""Laws of the true machine that no field of the nominal model holds, one small class each.
+
+Written from textbooks on friction, drives and transmissions, for a simulation that asks them anew
+at every tenth of the nominal step. `s` is the `truth.TrueSystem`: s.q, s.v are position and speed
+per link's joint on the motor's side (rad, rad/s, m, m/s), s.u the control as sent, s.tau the
+drives' force, s.time seconds since the recording began, s.dt the length of the substep. Forces are
+N·m or N. A law's `state` is what it remembers from one substep to the next.
+"""
+
+from diagnosis.trials.laws.base import (
+    Gate,
+    Law,
+    restore,
+    snapshot,
+)
+from diagnosis.trials.laws.drives import (
+    BackEmf,
+    DeadZone,
+    Delay,
+    GainFade,
+    Lag,
+    RateLimit,
+    TorqueSpeed,
+)
+from diagnosis.trials.laws.joints import (
+    Backlash,
+    Cogging,
+    ConstantTorque,
+    Coulomb,
+    CoupledFriction,
+    CoupledInertia,
+    CubicSpring,
+    FrictionMap,
+    JointElasticity,
+    LoadFriction,
+    Presliding,
+    QuadraticDamping,
+    Stribeck,
+    Transmission,
+)
+from diagnosis.trials.laws.unnamed import (
+    UNNAMED,
+    BrakeDrag,
+    CableDrag,
+    Detent,
+    FluidMemory,
+    Hysteresis,
+    NeighbourSpring,
+    OneWayBearing,
+    OneWayDrag,
+    PatchDamping,
+    SagGain,
+    Shaking,
+    SpeedRipple,
+    UnevenMotor,
+    WarmingGrease,
+    Wear,
+)
+from diagnosis.trials.laws.world import (
+    Air,
+    ExternalForce,
+    Payload,
+    SensorBias,
+    SensorDelay,
+    SensorScale,
+    drag,
+)
+
+__all__ = [
+    "Air",
+    "BackEmf",
+    "Backlash",
+    "BrakeDrag",
+    "CableDrag",
+    "Cogging",
+    "ConstantTorque",
+    "Coulomb",
+    "CoupledFriction",
+    "CoupledInertia",
+    "CubicSpring",
+    "DeadZone",
+    "Delay",
+    "Detent",
+    "ExternalForce",
+    "FluidMemory",
+    "FrictionMap",
+    "GainFade",
+    "Gate",
+    "Hysteresis",
+    "JointElasticity",
+    "Lag",
+    "Law",
+    "LoadFriction",
+    "NeighbourSpring",
+    "OneWayBearing",
+    "OneWayDrag",
+    "PatchDamping",
+    "Payload",
+    "Presliding",
+    "QuadraticDamping",
+    "RateLimit",
+    "SagGain",
+    "SensorBias",
+    "SensorDelay",
+    "SensorScale",
+    "Shaking",
+    "SpeedRipple",
+    "Stribeck",
+    "TorqueSpeed",
+    "Transmission",
+    "UNNAMED",
+    "UnevenMotor",
+    "WarmingGrease",
+    "Wear",
+    "drag",
+    "restore",
+    "snapshot",
+]
