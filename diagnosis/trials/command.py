@@ -21,7 +21,8 @@ from pathlib import Path
 from diagnosis.common.atomic_files import WriteError, write_whole
 from diagnosis.trials import page as proof_page
 from diagnosis.trials.audit import audit
-from diagnosis.trials.drawing import answer_text, draw_trial, write_folder
+from diagnosis.trials.drawing import draw_trial
+from diagnosis.trials.folder import answer_text, write_folder
 from diagnosis.trials.kept import is_kept
 from diagnosis.trials.robots import DEVELOPMENT
 from diagnosis.trials.sealing import (

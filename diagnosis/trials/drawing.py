@@ -6,20 +6,16 @@
 Everything follows from the key and the settings, so that anyone can draw the same trial again.
 """
 
-import csv
-import io
-import json
 from dataclasses import asdict, dataclass, field, replace
 
 import mujoco
 import numpy as np
 
-from diagnosis.common.atomic_files import write_together
-from diagnosis.trials import hiding
+from diagnosis.trials import groups, hiding
 from diagnosis.trials.disguise import disguise
 from diagnosis.trials.experiment import Plan, channel_noise, record
 from diagnosis.trials.hiding import Usage
-from diagnosis.trials.laws import Gate
+from diagnosis.trials.laws import Air, ExternalForce, Gate, Law, Payload, Transmission
 from diagnosis.trials.oracle import visibility
 from diagnosis.trials.prediction import model_error, system_error
 from diagnosis.trials.robots import TOUCHES, Robot, draw_robot, loguniform, to_mjcf
@@ -131,7 +127,7 @@ def _hide_all(rng, kind, settings, robot, plan, usage, chosen, target):
     nominal, true, laws, items, owners, setters = robot, robot, [], [], [], []
     for effect, spot in chosen:
         seed = int(rng.integers(2**31))
-        removed = effect in hiding.REMOVABLE and rng.random() < 0.55
+        removed = effect in groups.REMOVABLE and rng.random() < 0.55
         size = _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target)
         fresh = np.random.default_rng(seed)
         nominal, true, more, item = hiding.hide(
@@ -160,7 +156,7 @@ def _disguised(trial):
 
 def _motorless(chosen):
     """Is something hidden in a joint without a drive?"""
-    bare = {*hiding.OF_BODIES, *hiding.OF_WORLD, *hiding.OF_GROUND}
+    bare = {*groups.OF_BODIES, *groups.OF_WORLD, *groups.OF_GROUND}
     return any(spot.actuator < 0 and effect not in bare for effect, spot in chosen)
 
 
@@ -260,7 +256,7 @@ def choose(rng, kind, robot, mimic=False):
     mimic: two effects at one place that pass for each other.
     """
     count = {"null": 0, "single": 1, "unknown": 1, "pair": 2, "many": int(rng.integers(3, 5))}[kind]
-    names = hiding.UNNAMED if kind == "unknown" else (*hiding.FIELDS, *hiding.LAWS)
+    names = groups.UNNAMED if kind == "unknown" else (*groups.FIELDS, *groups.LAWS)
     offers = {name: hiding.places(robot, name) for name in names}
     offers = {name: spots for name, spots in offers.items() if spots}
     if mimic:
@@ -268,7 +264,7 @@ def choose(rng, kind, robot, mimic=False):
     if len(offers) < count:
         raise Unfit
     effects = [str(e) for e in rng.choice(sorted(offers), count, replace=False)]
-    if any(sum(e in family for e in effects) > 1 for family in hiding.FAMILIES):
+    if any(sum(e in family for e in effects) > 1 for family in groups.FAMILIES):
         raise Unfit
     if kind != "single" and "payload_change" in effects:  # it needs its moment
         raise Unfit
@@ -280,10 +276,10 @@ def choose(rng, kind, robot, mimic=False):
 
 
 def _mimics(rng, offers):
-    """Two effects of hiding.MIMICS at the same link. Raises Unfit."""
+    """Two effects of groups.MIMICS at the same link. Raises Unfit."""
     both = [
         (a, spot, b, other)
-        for a, b in hiding.MIMICS
+        for a, b in groups.MIMICS
         for spot in offers.get(a, ())
         for other in offers.get(b, ())
         if spot.link == other.link
@@ -317,7 +313,7 @@ def _fit_size(effect, spot, removed, robot, usage, plan, noise, seed, target):
 
 def _setter(effect, spot, values):
     """A function that gives a Robot this item's true values; laws change no Robot."""
-    if effect not in hiding.FIELDS and effect != hiding.WRONG_AXIS:
+    if effect not in groups.FIELDS and effect != groups.WRONG_AXIS:
         return lambda robot: robot
     return lambda robot: hiding.set_field(effect, spot, robot, values)
 
@@ -328,7 +324,7 @@ def _gate(rng, laws, plan, settings, usage):
     train, runs = settings.train_runs, settings.train_runs + settings.held_out_runs
     start = float(rng.uniform(0.3, 0.6) * plan.seconds)
     some = (int(rng.integers(train)), *range(train, runs))
-    if laws and isinstance(laws[0], hiding.L.Payload):  # one that never changes is a mass
+    if laws and isinstance(laws[0], Payload):  # one that never changes is a mass
         laws[0].__dict__.update({"start": start} if fate < 0.5 else {"runs": some})
         return laws
     gates = ({"start": start}, {"runs": some})
@@ -337,23 +333,23 @@ def _gate(rng, laws, plan, settings, usage):
     if fate < 0.16:
         return [Gate(law, **gates[fate < 0.08]) for law in laws]
     quantiles = [usage.quantiles[law.link] for law in laws]
-    if any(isinstance(law, (hiding.L.Air, hiding.L.ExternalForce)) for law in laws):
+    if any(isinstance(law, (Air, ExternalForce)) for law in laws):
         return laws
     return [Gate(law, within=(float(q[25]), float(q[65]))) for law, q in zip(laws, quantiles)]
 
 
 def _gateable(law):
     """May a law come and go? Not what delays, measures, couples, or carries a rotor."""
-    base = hiding.L.Law
+    base = Law
     fixed = ("control", "measure", "couple")
     same = all(getattr(type(law), name) is getattr(base, name) for name in fixed)
-    return same and not isinstance(law, hiding.L.Transmission)
+    return same and not isinstance(law, Transmission)
 
 
 def _gate_name(laws):
     """Which of the three, as a column says it; None where nothing comes and goes."""
     for law in laws:
-        if isinstance(law, (Gate, hiding.L.Payload)):
+        if isinstance(law, (Gate, Payload)):
             if getattr(law, "within", None):
                 return "part of the travel"
             return "one recording" if law.runs else "from a moment on"
@@ -389,48 +385,3 @@ def _answer(trial, kind, plan, settings):
         "step": trial.nominal.step,
         "integrator": trial.nominal.integrator,
     }
-
-
-# the folder
-
-
-def write_folder(trial, folder):
-    """Write sim.xml and the training recordings into `folder`; returns their names."""
-    model = mujoco.MjModel.from_xml_string(to_mjcf(trial.nominal))
-    files = {folder / "sim.xml": to_mjcf(trial.nominal)}
-    names = []
-    for run in trial.train:
-        names.append(f"train_{run.number}.csv")
-        files[folder / names[-1]] = to_csv(run, model)
-    write_together(files)
-    return names
-
-
-def to_csv(run, model):
-    """One Run as the contract's CSV text."""
-    header, columns = ["time"], [run.time]
-    for index in range(model.njnt):
-        joint = model.joint(index)
-        q, v = joint.qposadr[0], joint.dofadr[0]
-        free = model.jnt_type[index] == mujoco.mjtJoint.mjJNT_FREE
-        tags = lambda n: [f":{k}" for k in range(n)] if free else [""]
-        for k, tag in enumerate(tags(7)):
-            header.append(f"qpos:{joint.name}{tag}")
-            columns.append(run.qpos[:, q + k])
-        if np.isfinite(run.qvel).all():
-            for k, tag in enumerate(tags(6)):
-                header.append(f"qvel:{joint.name}{tag}")
-                columns.append(run.qvel[:, v + k])
-    for k in range(model.nu):
-        header.append(f"ctrl:{model.actuator(k).name}")
-        columns.append(run.ctrl[:, k])
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(header)
-    writer.writerows([f"{value:.9g}" for value in row] for row in np.column_stack(columns))
-    return text.getvalue()
-
-
-def answer_text(answer):
-    """The answer as one line of JSON, the same for the same answer."""
-    return json.dumps(answer, sort_keys=True)

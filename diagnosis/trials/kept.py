@@ -9,7 +9,7 @@ bench/ is what a tool gets; held_out.npz and answer.json are for scoring alone.
 import json
 
 from diagnosis.common.atomic_files import write_whole
-from diagnosis.trials.drawing import write_folder
+from diagnosis.trials.folder import write_folder
 from diagnosis.trials.prediction import system_error
 from diagnosis.trials.replay import save_runs
 

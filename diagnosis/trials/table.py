@@ -24,7 +24,8 @@ import mujoco
 from tqdm import tqdm
 
 from diagnosis.common.atomic_files import write_table
-from diagnosis.trials.drawing import answer_text, draw_trial
+from diagnosis.trials.drawing import draw_trial
+from diagnosis.trials.folder import answer_text
 from diagnosis.trials.kept import BENCH, HELD_OUT, keep, read_answer
 from diagnosis.trials.prediction import model_error
 from diagnosis.trials.replay import load_runs, replay
