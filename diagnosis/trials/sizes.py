@@ -3,50 +3,22 @@
 import numpy as np
 
 from diagnosis.trials import laws as L
-from diagnosis.trials.groups import OF_DRIVES, OF_GROUND
+from diagnosis.trials.groups import OF_BODIES, OF_DRIVES, OF_GROUND
 
 
 def field_values(effect, spot, size, robot, usage, rng):
     """(values of the robot without it, values with it, place) of a field."""
+    if effect in OF_BODIES:
+        return _body_values(effect, spot, size, robot, rng)
+    if effect == "gravity" or effect in OF_GROUND:
+        return _world_values(effect, spot, size, robot, rng)
     i, link = spot.link, robot.links[spot.link]
     joint = {"kind": "joint", "name": link.joint_name}
-    body = {"kind": "body", "name": link.name}
-    world = {"kind": "world", "name": "world"}
     load, speed, inertia = usage.load[i], usage.speed[i], usage.inertia[i]
-    vector = lambda names, values: dict(zip(names, (float(v) for v in values)))
-    if effect == "mass":
-        return {"mass": link.mass}, {"mass": link.mass * (1 + 1.5 * size)}, body
-    if effect == "inertia":
-        names = ("ixx", "iyy", "izz")
-        wider = np.array(link.inertia) * (1 + 3 * size)
-        return vector(names, link.inertia), vector(names, wider), body
-    if effect == "center_of_mass":
-        turn = rng.normal(size=3)
-        shift = size * link.length * turn / np.linalg.norm(turn)
-        center = np.array(link.center_of_mass)
-        return vector("xyz", center), vector("xyz", center + shift), body
-    if effect == "link_length":
-        length = float(np.linalg.norm(link.position))
-        return {"length": length}, {"length": length * (1 + spot.sign * 0.5 * size)}, body
-    if effect == "gravity":
-        turn = rng.uniform(0, 2 * np.pi)
-        tilt = min(0.5 * size, 0.4)
-        down = 9.81 * np.array(
-            [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)]
-        )
-        return vector("xyz", robot.gravity), vector("xyz", down), world
     if effect == "joint_stop":
         side = max(0.01, 0.4 * min(size, 1))
         low, high = np.quantile(usage.quantiles[i], (side, 1 - side))
         return {"low": None, "high": None}, {"low": float(low), "high": float(high)}, joint
-    if effect in OF_GROUND:
-        field, name = OF_GROUND[effect]
-        base = getattr(robot, field)
-        lower = {"contact_friction": 1 / (1 + 2 * size)}.get(
-            effect, 1 + 2 * spot.sign * min(size, 0.4)
-        )
-        value = base + 0.03 * spot.sign * size if effect == "ground_height" else base * lower
-        return {name: base}, {name: float(value)}, {"kind": "geom", "name": "ground"}
     if effect == "armature":
         return {effect: link.armature}, {effect: link.armature + 2 * size * inertia}, joint
     if effect == "viscous_damping":
@@ -57,6 +29,11 @@ def field_values(effect, spot, size, robot, usage, rng):
     if effect == "stiffness":
         more = 2 * size * load / usage.spread[i]
         return {effect: link.stiffness}, {effect: link.stiffness + more}, joint
+    return _drive_values(effect, spot, size, robot, usage)
+
+
+def _drive_values(effect, spot, size, robot, usage):
+    i, load = spot.link, usage.load[spot.link]
     actuator = robot.actuators[spot.actuator]
     drive = {"kind": "actuator", "name": actuator.name}
     bounded = np.clip(spot.sign * size, -0.6, 1.5)
@@ -70,6 +47,45 @@ def field_values(effect, spot, size, robot, usage, rng):
         return {"kv": actuator.kv}, {"kv": float(actuator.kv * (1 + bounded))}, drive
     most = np.quantile(usage.torque_quantiles[i], max(0.3, 1 - 0.7 * size))
     return {"forcerange": actuator.limit}, {"forcerange": float(most)}, drive
+
+
+def _body_values(effect, spot, size, robot, rng):
+    link = robot.links[spot.link]
+    body = {"kind": "body", "name": link.name}
+    if effect == "mass":
+        return {"mass": link.mass}, {"mass": link.mass * (1 + 1.5 * size)}, body
+    if effect == "inertia":
+        names = ("ixx", "iyy", "izz")
+        wider = np.array(link.inertia) * (1 + 3 * size)
+        return _vector(names, link.inertia), _vector(names, wider), body
+    if effect == "center_of_mass":
+        turn = rng.normal(size=3)
+        shift = size * link.length * turn / np.linalg.norm(turn)
+        center = np.array(link.center_of_mass)
+        return _vector("xyz", center), _vector("xyz", center + shift), body
+    length = float(np.linalg.norm(link.position))
+    return {"length": length}, {"length": length * (1 + spot.sign * 0.5 * size)}, body
+
+
+def _world_values(effect, spot, size, robot, rng):
+    world = {"kind": "world", "name": "world"}
+    if effect == "gravity":
+        turn = rng.uniform(0, 2 * np.pi)
+        tilt = min(0.5 * size, 0.4)
+        down = 9.81 * np.array(
+            [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)]
+        )
+        return _vector("xyz", robot.gravity), _vector("xyz", down), world
+    field, name = OF_GROUND[effect]
+    base = getattr(robot, field)
+    lower = {"contact_friction": 1 / (1 + 2 * size)}.get(effect, 1 + 2 * spot.sign * min(size, 0.4))
+    value = base + 0.03 * spot.sign * size if effect == "ground_height" else base * lower
+    return {name: base}, {name: float(value)}, {"kind": "geom", "name": "ground"}
+
+
+def _vector(names, values):
+    """{name: float} of a vector."""
+    return dict(zip(names, (float(v) for v in values)))
 
 
 def named_law(effect, spot, size, robot, usage, rng):
@@ -159,6 +175,13 @@ def _drive_law(effect, spot, size, robot, usage, unit):
         driving = min(size, 0.6)
         law = L.LoadFriction(i, driving=driving, driven=min(driving * unit(0.5, 1.2), 0.7))
         return law, joint, law.parameters
+    return _transmission(effect, spot, size, robot, usage, unit)
+
+
+def _transmission(effect, spot, size, robot, usage, unit):
+    """An elastic joint or one with play, its rotor's resonance well above the motion."""
+    i, link = spot.link, robot.links[spot.link]
+    joint = {"kind": "joint", "name": link.joint_name}
     rotor = link.armature
     reduced = rotor * usage.inertia[i] / (rotor + usage.inertia[i])
     if effect == "joint_elasticity":
@@ -206,6 +229,10 @@ def unnamed_law(name, spot, size, robot, usage, rng):
     spread, amount = float(usage.spread[i]), size * float(usage.load[i])
     unit = lambda low, high: float(rng.uniform(low, high))
     spot_at = lambda low, high: float(np.quantile(usage.quantiles[i], unit(low, high)))
+    patch = lambda low, high, thin, wide: {
+        "at": spot_at(low, high),
+        "width": spread * unit(thin, wide),
+    }
     waves = float(max(1, round(unit(2, 5) / spread)))
     parameters = {
         "Hysteresis": lambda: {"stiffness": amount / (0.4 * spread), "reach": 0.4 * spread},
@@ -213,16 +240,8 @@ def unnamed_law(name, spot, size, robot, usage, rng):
             "damping": 2 * amount / speed,
             "heat": amount * speed * unit(0.8, 2.0),
         },
-        "Detent": lambda: {
-            "amplitude": amount,
-            "at": spot_at(0.3, 0.7),
-            "width": spread * unit(0.2, 0.4),
-        },
-        "CableDrag": lambda: {
-            "amplitude": amount,
-            "at": spot_at(0.4, 0.7),
-            "width": spread * unit(0.4, 0.8),
-        },
+        "Detent": lambda: {"amplitude": amount, **patch(0.3, 0.7, 0.2, 0.4)},
+        "CableDrag": lambda: {"amplitude": amount, **patch(0.4, 0.7, 0.4, 0.8)},
         "SpeedRipple": lambda: {"amplitude": amount, "speed": speed, "waves": waves},
         "NeighbourSpring": lambda: {
             "amplitude": amount,
@@ -239,11 +258,7 @@ def unnamed_law(name, spot, size, robot, usage, rng):
             "waves": waves,
             "phase": unit(0, 6.28),
         },
-        "PatchDamping": lambda: {
-            "damping": 3 * amount / speed,
-            "at": spot_at(0.25, 0.75),
-            "width": spread * unit(0.2, 0.5),
-        },
+        "PatchDamping": lambda: {"damping": 3 * amount / speed, **patch(0.25, 0.75, 0.2, 0.5)},
         "SagGain": lambda: {
             "share": min(size, 0.7),
             "full": float(np.quantile(usage.torque_quantiles[i], 0.95)),

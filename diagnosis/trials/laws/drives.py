@@ -59,7 +59,7 @@ class RateLimit(Law):
 
 
 class DeadZone(Law):
-    """Control (of a motor) or force (of a servo) nearer to zero than w does nothing: y = dead(x)."""
+    """Control (of a motor) or force (of a servo) nearer to zero than w does nothing."""
 
     effect = "dead_zone"
 

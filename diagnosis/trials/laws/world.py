@@ -83,7 +83,7 @@ def drag(model, data, density, wind):
     """Air drag on every body's box of equal inertia, as force and torque at its centre (nbody, 6).
 
     Each face pair of area A meets the air at speed w: force -density A w |w| / 2 along its normal.
-    Spin: the same pressure over faces turning through the air, as MuJoCo's inertia-box model has it.
+    Spin: the same pressure over faces turning in the air, as in MuJoCo's inertia-box model.
     """
     out = np.zeros((model.nbody, 6))
     velocity = np.empty(6)
