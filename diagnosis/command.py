@@ -39,6 +39,7 @@ from diagnosis.recordings.layout import Layout
 from diagnosis.recordings.quality import assess, told
 from diagnosis.report import text as wording
 from diagnosis.report import writer
+from diagnosis.report.per_recording import with_each_recording
 
 REFUSED = (  # what the user can mend
     recorded.RecordingError,
@@ -87,8 +88,10 @@ def diagnose(
         train, held = split(train)
     plausibility.enough(train)
     diagnosis = identify(world, train, held, progress=progress)
-    warnings = notes + diagnosis.summary["warnings"]
-    return dataclasses.replace(diagnosis, summary={**diagnosis.summary, "warnings": warnings})
+    each = diagnosis.world, diagnosis.settings, diagnosis.train
+    summary = with_each_recording(*each, diagnosis.summary)
+    summary = {**summary, "warnings": notes + summary["warnings"]}
+    return dataclasses.replace(diagnosis, summary=summary)
 
 
 def split(recordings):
