@@ -129,11 +129,11 @@ def trial(seed: int, number: int) -> dict | None:
     """A row of the table, or None where the first recording leaves one effect alone."""
     rng = np.random.default_rng([seed, number])
     body = {"mass": rng.uniform(0.4, 1.2), "length": rng.uniform(0.2, 0.4)}
-    truth, noise = str(rng.choice(list(EFFECTS))), 0.002
+    truth, noise = str(rng.choice(list(EFFECTS))), 0.004
     nominal, scale = EFFECTS[truth][2], EFFECTS[truth][4]
     real = xml(**body, **{truth: nominal + scale * rng.uniform(0.5, 1.5)})
     t = PERIOD * np.arange(int(SECONDS / PERIOD))
-    frequency, size = rng.uniform(0.4, 3.0), rng.uniform(0.2, 0.6)
+    frequency, size = rng.uniform(0.4, 3.0), rng.uniform(0.05, 0.2)
     old = size * np.sin(2 * np.pi * frequency * t) * np.minimum(1, t)
 
     def record(ctrl):
