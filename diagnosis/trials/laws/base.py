@@ -38,7 +38,7 @@ class Law:
         """Add to s.data.xfrc_applied."""
 
     def couple(self, acceleration, mobility):
-        """Force on both joints, from the sum of accelerations without it and that of M⁻¹'s block."""
+        """Force on both joints, from the sum of accelerations without it and of M⁻¹'s block."""
 
     def measure(self, s, q, v):
         """Change what ideal sensors of these faults read, (links,) each, in place."""
