@@ -84,14 +84,21 @@ def diagnose(
     train, held = given[: len(train)], given[len(train) :]
     notes += plausibility.check(given, world.model)
     notes += _runs(world.model, given) + told(given, world.model)
-    if not held:
-        train, held = split(train)
+    train, kept = _kept_back(train) if held else split(train)
     plausibility.enough(train)
-    diagnosis = identify(world, train, held, progress=progress)
+    diagnosis = identify(world, train, held or kept, kept, progress=progress)
     each = diagnosis.world, diagnosis.settings, diagnosis.train
     summary = with_each_recording(*each, diagnosis.summary)
     summary = {**summary, "warnings": notes + summary["warnings"]}
     return dataclasses.replace(diagnosis, summary=summary)
+
+
+def _kept_back(recordings):
+    """(for fitting, to decide what is handed over): as split(), all for both where they are short."""
+    try:
+        return split(recordings)
+    except recorded.RecordingError:
+        return recordings, recordings
 
 
 def split(recordings):

@@ -53,10 +53,11 @@ class Outcome:
     event: object = None
 
 
-def identify(world, train, held_out, progress=None, log=None):
+def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     """Diagnose a simulator from recordings.
 
-    world: simulator.World; train, held_out: lists of Recording. progress(done, message): called
+    world: simulator.World; train, held_out, kept_back: lists of Recording; the last decide what is
+    handed over (held_out by default). progress(done, message): called
     with the share done,
     0..1; log(message): with every decision. Raises RecordingError where the data say too little.
     """
@@ -83,7 +84,7 @@ def identify(world, train, held_out, progress=None, log=None):
     outcome = _checked(search, found, fitted, others, log)
     outcome.event = event
     say(0.85, "checking what is handed over")
-    _hand_over(world, train, held_out or train, outcome, log)
+    _hand_over(world, held_out or train, kept_back or held_out or train, outcome, log)
     say(0.95, "held-out error")
     return findings.assemble(world, train, held_out, outcome)
 
@@ -140,17 +141,17 @@ def _strain(candidate, values, prior):
     return f"{p.name} {values[k]:.3g} {p.unit}: {usual}"
 
 
-def _hand_over(world, train, held, outcome, log):
-    """Fill in the Handed: what of the findings kept-back recordings need; the rest of the findings
-    goes."""
+def _hand_over(world, held, kept_back, outcome, log):
+    """Fill in the Handed: what of the findings kept-back recordings need; the rest goes."""
     setting = outcome.fitted.setting
-    check = Check(world, held, Smoother(world, held), setting)
-    outcome.handed = accepted(world, check, setting, log)
+    check = Check(world, held, Smoother(world, held))
+    decides = check if kept_back is held else Check(world, kept_back, Smoother(world, kept_back))
+    outcome.handed = accepted(world, decides, setting, log)
     kept = outcome.handed.setting
     if len(kept) < len(setting):
         outcome.fitted = outcome.found.judge.fit(kept, steps=0)
     check.locate(kept)
     outcome.held_check = check
     smoother = outcome.found.smoother
-    outcome.train_check = Check(world, smoother.recordings, smoother, kept)
+    outcome.train_check = Check(world, smoother.recordings, smoother)
     outcome.train_check.trajectory = outcome.trajectory

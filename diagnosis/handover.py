@@ -64,11 +64,11 @@ class Check:
     """Windows of recordings, as the contract's error has them, with a smoothed trajectory for its
     floor."""
 
-    def __init__(self, world, recordings, smoother, setting):
+    def __init__(self, world, recordings, smoother):
         self.world, self.recordings, self.smoother = world, recordings, smoother
         self.windows = prediction_error.consecutive(recordings, cut.HORIZON)
         self.noise = prediction_error.reporting_noise(smoother.position_noise)
-        self.setting, self.trajectory, self.scatter = setting, None, 0.0
+        self.trajectory, self.scatter = None, 0.0
 
     def locate(self, setting):
         """Smooth the recordings under a setting, for the floor."""
