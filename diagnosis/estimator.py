@@ -8,16 +8,17 @@ Held-out recordings enter only after everything is chosen and fitted: they decid
 over.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from diagnosis import findings
+from diagnosis.estimation.each_recording import each_recording
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
-from diagnosis.selection.criterion import paired
+from diagnosis.selection.criterion import Evidence, paired
 from diagnosis.selection.identification import Found, Identification
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
@@ -51,6 +52,8 @@ class Outcome:
     train_check: Check = None
     held_check: Check = None
     event: object = None
+    each: dict = field(default_factory=dict)
+    earned: bool = False
 
 
 def identify(world, train, held_out, kept_back=None, progress=None, log=None):
@@ -82,7 +85,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     fitted, others = rivals.classes(search.candidates, found.judge, found.fitted, log)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
-    outcome.event = event
+    outcome.event, outcome.earned = event, bool(outcome.fitted.setting or event)
     say(0.85, "checking what is handed over")
     _hand_over(world, held_out or train, kept_back or held_out or train, outcome, log)
     say(0.95, "held-out error")
@@ -150,6 +153,7 @@ def _hand_over(world, held, kept_back, outcome, log):
     kept = outcome.handed.setting
     if len(kept) < len(setting):
         outcome.fitted = outcome.found.judge.fit(kept, steps=0)
+    outcome.each = each_recording(outcome.fitted, Evidence)
     check.locate(kept)
     outcome.held_check = check
     smoother = outcome.found.smoother

@@ -12,6 +12,7 @@ import numpy as np
 from diagnosis.effects.base import JOINT_TRANSMISSIONS
 from diagnosis.estimation import prediction_error
 from diagnosis.estimation import windows as cut
+from diagnosis.estimation.each_recording import p_of_constancy
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults, transients
@@ -19,7 +20,6 @@ from diagnosis.selection import sensor_faults, transients
 SCATTER = (
     2.0  # standard deviations of a perfect simulator's squared error, that are nothing unexplained
 )
-MUCH = 0.2  # share of the nominal error's square, above which what is left is unexplained
 POINTS = 400  # of a located force that are told
 
 
@@ -67,18 +67,19 @@ def assemble(world, train, held_out, outcome):
     left = unexplained(
         *(figures["held_out"][k] for k in ("before", "after", "floor")), check.scatter
     )
-    hint = outcome.left[0] if outcome.left else None
+    left = left if outcome.earned else 0.0  # else it is noise of a kind that the floor has not
+    hint = outcome.left[0] if outcome.left and left > 0 else None
     summary = {
         "format": 2,
-        "verdict": verdict(findings, left),
+        "verdict": verdict(findings, outcome.earned),
         "noise": noise_by_channel(world.model, outcome.found.smoother.position_noise),
         "findings": findings,
         "fit": figures,
         "missing_force": missing_force(world, outcome),
         "unexplained": {
             "fraction": left,
-            "place": {"kind": "joint", "name": hint.joint} if hint and left else None,
-            "depends_on": list(hint.variables) if hint and left else [],
+            "place": {"kind": "joint", "name": hint.joint} if hint else None,
+            "depends_on": list(hint.variables) if hint else [],
         },
         "warnings": [],
     }
@@ -96,15 +97,15 @@ def assemble(world, train, held_out, outcome):
     )
 
 
-def verdict(findings, left):
-    """match, mismatch, or unresolved: something is missing and no name explains it well enough."""
+def verdict(findings, earned):
+    """match, mismatch, or unresolved: something is missing and no name explains it well enough.
+
+    earned: whether any effect or curve earned its place, before the kept-back recordings decided.
+    """
     if not findings:
-        return "unresolved" if left > MUCH else "match"
-    return (
-        "mismatch"
-        if findings[0]["effect"] != "unknown" and findings[0]["adequate"]
-        else "unresolved"
-    )
+        return "unresolved" if earned else "match"
+    named = findings[0]["effect"] != "unknown" and findings[0]["adequate"]
+    return "mismatch" if named else "unresolved"
 
 
 def _finding(world, candidate, outcome, bounds, figure):
@@ -136,8 +137,29 @@ def _finding(world, candidate, outcome, bounds, figure):
             {"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, v)}
             for c, v in outcome.others.get(candidate, [])
         ],
+        **_by_recording(candidate, outcome),
         **({"curve": form} if curve else {}),
         **({"rest_depends_on": list(rest.variables)} if rest else {}),
+    }
+
+
+def _by_recording(candidate, outcome):
+    """per_recording and constancy of a finding, where two recordings or more tell its value."""
+    rows = outcome.each.get(candidate, [])
+    if not rows:
+        return {}
+    of = [[(v, h) for _, k, v, h in rows if k == i] for i in range(len(candidate.parameters))]
+    return {
+        "per_recording": [
+            {
+                "recording": name,
+                "parameter": candidate.parameters[k].name,
+                "value": value,
+                "interval": [value - half, value + half],
+            }
+            for name, k, value, half in rows
+        ],
+        "constancy": min(p_of_constancy(some) for some in of if len(some) > 1),
     }
 
 

@@ -72,7 +72,7 @@ class Smoother:
         self.position = cut.difference(
             model, self.qpos, np.where(np.isfinite(measured_q), self.qpos, np.nan)
         )
-        self.velocity = np.concatenate([r.qvel for r in recordings])
+        self.velocity = np.concatenate([_measured_velocity(model, r) for r in recordings])
         self._blocks(starts)
         self.floor = self._floors(recordings)
         self.R = self.floor.copy()
@@ -224,3 +224,13 @@ class Smoother:
         self.walk = np.maximum(self.walk * ratio(found.process)[2 * nv :], 1e-12 * self.scale**2)
         known = found.measurement[1] > 0
         self.R = np.where(known, np.maximum(self.R * ratio(found.measurement), self.floor), self.R)
+
+
+def _measured_velocity(model, recording):
+    """qvel (T, nv) of a recording, NaN where it is not measured: of joints whose velocities are
+    filtered differences of the positions, which are late and tell nothing more."""
+    qvel, quality = np.array(recording.qvel, float), recording.quality
+    for j, _, _, v in cut.joint_slices(model):
+        if quality and cut.joint_name(model, j) in quality.differenced:
+            qvel[:, v] = np.nan
+    return qvel
