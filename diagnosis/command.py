@@ -94,7 +94,8 @@ def diagnose(
 
 
 def _kept_back(recordings):
-    """(for fitting, to decide what is handed over): as split(), all for both where they are short."""
+    """(for fitting, to decide what is handed over): as split(); all for both where they are
+    short."""
     try:
         return split(recordings)
     except recorded.RecordingError:

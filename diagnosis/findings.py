@@ -54,24 +54,15 @@ def assemble(world, train, held_out, outcome):
     )
     if others := sensor_faults.errors(world, settings, check.recordings):
         figures["held_out"]["sensors"] = others
-    findings = [_finding(world, c, outcome, bounds, figures["held_out"]) for c in settings]
-    findings.sort(
-        key=lambda f: (f["effect"] != "unknown", -f["evidence"]["held_out_error_removed"])
-    )
-    if outcome.event:
-        findings.append(transients.finding(outcome.event))
-    findings += sensor_faults.faults(
-        world, settings, outcome.found.smoother.recordings, outcome.trajectory, outcome.event
-    )
-    findings.sort(key=lambda f: -f["evidence"]["held_out_error_removed"])
-    left = unexplained(
-        *(figures["held_out"][k] for k in ("before", "after", "floor")), check.scatter
-    )
-    left = left if outcome.earned else 0.0  # else it is noise of a kind that the floor has not
+    figure = figures["held_out"]
+    findings = _findings(world, outcome, bounds, figure)
+    left = unexplained(figure["before"], figure["after"], figure["floor"], check.scatter)
+    if not findings and not outcome.earned and figure["after"] < COLOURED * figure["floor"]:
+        left = 0.0  # noise that is not white does as much
     hint = outcome.left[0] if outcome.left and left > 0 else None
     summary = {
         "format": 2,
-        "verdict": verdict(findings, outcome.earned),
+        "verdict": verdict(findings, left > 0),
         "noise": noise_by_channel(world.model, outcome.found.smoother.position_noise),
         "findings": findings,
         "fit": figures,
@@ -97,13 +88,21 @@ def assemble(world, train, held_out, outcome):
     )
 
 
-def verdict(findings, earned):
-    """match, mismatch, or unresolved: something is missing and no name explains it well enough.
+def _findings(world, outcome, bounds, figure):
+    """All findings, the most important first: of the model, of a while, of sensors."""
+    settings = outcome.fitted.setting
+    found = [_finding(world, c, outcome, bounds, figure) for c in settings]
+    if outcome.event:
+        found.append(transients.finding(outcome.event))
+    recordings = outcome.found.smoother.recordings
+    found += sensor_faults.faults(world, settings, recordings, outcome.trajectory, outcome.event)
+    return sorted(found, key=lambda f: -f["evidence"]["held_out_error_removed"])
 
-    earned: whether any effect or curve earned its place, before the kept-back recordings decided.
-    """
+
+def verdict(findings, something):
+    """match, mismatch, or unresolved: something is missing and no name explains it well enough."""
     if not findings:
-        return "unresolved" if earned else "match"
+        return "unresolved" if something else "match"
     named = findings[0]["effect"] != "unknown" and findings[0]["adequate"]
     return "mismatch" if named else "unresolved"
 

@@ -1,6 +1,7 @@
 """The value that each recording alone asks for, about the values fitted to all.
 
-asked = each_recording(fitted)      # {candidate: [(recording, parameter, value, half width, error)]}
+asked = each_recording(fitted)      # {candidate: [(recording, parameter, value, half width,
+error)]}
 """
 
 from types import SimpleNamespace
@@ -16,8 +17,10 @@ FEWEST = 4  # windows of a recording, from which on its own value is told
 def each_recording(fitted, make_evidence):
     """Values by recording of a Fitted set: one Gauss-Newton step of its windows alone.
 
-    make_evidence(ahead, residual, columns): the criterion's Evidence. Returns {candidate: [(recording
-    name, parameter index, value, half width of the 95 % interval)]} where two recordings or more tell.
+    make_evidence(ahead, residual, columns): the criterion's Evidence. Returns {candidate:
+    [(recording
+    name, parameter index, value, half width of the 95 % interval)]} where two recordings or more
+    tell.
     """
     ahead, columns, out = fitted.columns.ahead, fitted.columns, {}
     array = columns.array
