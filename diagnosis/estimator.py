@@ -8,17 +8,16 @@ Held-out recordings enter only after everything is chosen and fitted: they decid
 over.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from diagnosis import findings
-from diagnosis.estimation.each_recording import each_recording
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
-from diagnosis.selection.criterion import Evidence, paired
+from diagnosis.selection.criterion import paired
 from diagnosis.selection.identification import Found, Identification
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
@@ -52,7 +51,6 @@ class Outcome:
     train_check: Check = None
     held_check: Check = None
     event: object = None
-    each: dict = field(default_factory=dict)
     earned: bool = False
 
 
@@ -153,7 +151,6 @@ def _hand_over(world, held, kept_back, outcome, log):
     kept = outcome.handed.setting
     if len(kept) < len(setting):
         outcome.fitted = outcome.found.judge.fit(kept, steps=0)
-    outcome.each = each_recording(outcome.fitted, Evidence)
     check.locate(kept)
     outcome.held_check = check
     smoother = outcome.found.smoother

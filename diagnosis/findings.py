@@ -12,7 +12,6 @@ import numpy as np
 from diagnosis.effects.base import JOINT_TRANSMISSIONS
 from diagnosis.estimation import prediction_error
 from diagnosis.estimation import windows as cut
-from diagnosis.estimation.each_recording import p_of_constancy
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults, transients
@@ -136,29 +135,8 @@ def _finding(world, candidate, outcome, bounds, figure):
             {"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, v)}
             for c, v in outcome.others.get(candidate, [])
         ],
-        **_by_recording(candidate, outcome),
         **({"curve": form} if curve else {}),
         **({"rest_depends_on": list(rest.variables)} if rest else {}),
-    }
-
-
-def _by_recording(candidate, outcome):
-    """per_recording and constancy of a finding, where two recordings or more tell its value."""
-    rows = outcome.each.get(candidate, [])
-    if not rows:
-        return {}
-    of = [[(v, h) for _, k, v, h in rows if k == i] for i in range(len(candidate.parameters))]
-    return {
-        "per_recording": [
-            {
-                "recording": name,
-                "parameter": candidate.parameters[k].name,
-                "value": value,
-                "interval": [value - half, value + half],
-            }
-            for name, k, value, half in rows
-        ],
-        "constancy": min(p_of_constancy(some) for some in of if len(some) > 1),
     }
 
 

@@ -28,11 +28,13 @@ def intervals(fitted):
             continue
         for row in option.directions:
             k = int(np.flatnonzero(row)[0])
-            middle = values[k] + shift[at] * row[k]
-            width = half[at] * abs(row[k])
+            width = (half[at] + abs(shift[at])) * abs(row[k])  # a refit ends short of its optimum
             if np.isfinite(width):
                 low, high = option.prior.low[k], option.prior.high[k]
-                out[c][k] = (float(max(middle - width, low)), float(min(middle + width, high)))
+                out[c][k] = (
+                    float(max(values[k] - width, low)),
+                    float(min(values[k] + width, high)),
+                )
             at += 1
     return out
 
