@@ -16,9 +16,8 @@ from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults, transients
 
-SCATTER = (
-    2.0  # standard deviations of a perfect simulator's squared error, that are nothing unexplained
-)
+SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing
+COLOURED = 3.0  # of its error under white noise, what noise of another kind may reach
 POINTS = 400  # of a located force that are told
 
 
