@@ -10,6 +10,10 @@ freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipto
 import numpy as np
 from scipy import stats
 
+SHARED = (
+    0.01  # of a direction that is not seen, the part from which on a column's value is not told
+)
+FLAT = 0.2  # of the squares' curvature, the least that the loss's is taken for
 UNSEEN = 1e-8  # share of a column's information that the others leave, below which it is not seen
 
 
@@ -52,7 +56,7 @@ def half_widths(evidence, index):
     values, vectors = np.linalg.eigh(whole)
     seen = values > UNSEEN
     inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
-    unseen = np.diag(np.eye(p) - vectors[:, seen] @ vectors[:, seen].T) > 0.5
+    unseen = np.diag(np.eye(p) - vectors[:, seen] @ vectors[:, seen].T) > SHARED
     moves = inverse @ score.sum(0)
     left = score - gram @ moves
     root = (vectors[:, seen] / np.sqrt(values[seen])) @ vectors[:, seen].T
@@ -68,8 +72,22 @@ def half_widths(evidence, index):
         shares[g] = np.einsum("ij,jk,ki->i", inverse, H, inverse) / np.maximum(
             np.diag(inverse), 1e-300
         )
-    covariance = inverse @ meat @ inverse
+    curvature = _curvature(evidence, index, weight, root / scale[:, None])
+    bread = root @ np.linalg.inv(curvature) @ root.T
+    covariance = bread @ meat @ bread
     freedom = np.maximum(1 / np.maximum((shares**2).sum(0), 1e-9) - 1, 1.0)
     half = stats.t.ppf(0.975, freedom) * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     half[unseen] = np.inf
     return half / scale, moves / scale
+
+
+def _curvature(evidence, index, weight, root):
+    """The loss's curvature (p, p) over that of least squares with fixed weights, in whitened columns.
+
+    The log of a cell's square bends less than the square itself, for a cell that errs much counts
+    less: 1/2 log s has the second derivative X'X / ns - 2 X'r r'X / (ns)^2.
+    """
+    score = evidence.gram[:, :, 0][..., index[1:]] @ root
+    less = np.einsum("gc,gci,gcj->ij", 2 * weight**2, score, score)
+    values, vectors = np.linalg.eigh(np.eye(len(root)) - less)
+    return (vectors * np.clip(values, FLAT, None)) @ vectors.T

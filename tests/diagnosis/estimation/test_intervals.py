@@ -1,0 +1,68 @@
+"""Coverage of intervals under noise that is common to groups, for many parameters and for one."""
+
+import numpy as np
+import pytest
+from synthetic import clustered, evidence_of, free, scene
+
+from diagnosis.estimation import groups
+from diagnosis.estimation.intervals import half_widths
+
+
+def fitted(ahead, residual, columns):
+    """(values, half widths): columns' amounts refitted until nothing moves, as a judge does."""
+    every = np.arange(columns.shape[-1] + 1)
+    values = np.zeros(len(every) - 1)
+    for _ in range(4):
+        evidence = evidence_of(ahead, residual - columns @ values, columns)
+        values = values + free(evidence, every[:-1]).amounts
+    half, moves = half_widths(evidence_of(ahead, residual - columns @ values, columns), every)
+    return values + moves, half
+
+
+@pytest.mark.parametrize("number, bands", [(6, 1), (16, 3)])
+@pytest.mark.parametrize("kind", ["common", "walk"])
+def test_half_widths_cover_whatever_groups_have_in_common(number, bands, kind):
+    """Noise that windows of a group share, and noise that is summed up along windows."""
+    rng, inside = np.random.default_rng(0), []
+    for _ in range(60):
+        ahead = scene(groups=number, windows=3, rows=12, bands=bands)
+        if kind == "common":
+            columns, noise = clustered(rng, ahead, (3,), share=0.3), clustered(rng, ahead)
+        else:
+            columns = np.cumsum(rng.normal(size=(*ahead.known.shape, 3)), 1)
+            noise = np.cumsum(np.cumsum(rng.normal(size=ahead.known.shape), 1), 1)
+        truth = rng.normal(size=3)
+        values, half = fitted(ahead, columns @ truth + noise, columns)
+        inside.append(abs(values - truth) < half)
+    assert 0.90 <= np.mean(inside) <= 0.99
+
+
+def test_noise_without_groups_gives_the_textbooks_interval():
+    rng, ahead = np.random.default_rng(1), scene(groups=40, windows=2, rows=30)
+    columns = rng.normal(size=(*ahead.known.shape, 2))
+    residual = rng.normal(size=ahead.known.shape)
+    _, half = fitted(ahead, residual, columns)
+    assert half == pytest.approx(1.96 / np.sqrt(residual.size), rel=0.3)
+
+
+def test_what_others_do_as_well_has_no_interval():
+    rng, ahead = np.random.default_rng(2), scene()
+    column = clustered(rng, ahead, (1,))
+    three = np.concatenate([column, 2 * column, clustered(rng, ahead, (1,))], -1)
+    half, _ = half_widths(evidence_of(ahead, clustered(rng, ahead), three), np.arange(4))
+    assert np.isinf(half[:2]).all() and np.isfinite(half[2])
+
+
+@pytest.mark.parametrize("number", [5, 16])
+def test_one_number_covers_and_its_p_values_are_even(number):
+    rng, inside, low = np.random.default_rng(3), [], []
+    label = np.repeat(np.arange(number), 30)
+    for _ in range(400):
+        x = rng.normal(size=len(label)) + rng.normal(size=number)[label]
+        noise = rng.normal(size=len(label)) + rng.normal(size=number)[label]
+        total = lambda z: groups.summed(label, z)
+        line = groups.fitted(total(x**2), total(x * (0.7 * x + noise)))
+        inside.append(abs(line.value - 0.7) < line.half)
+        low.append(groups.fitted(total(x**2), total(x * noise)).p_value < 0.05)
+    assert 0.92 < np.mean(inside) < 0.985 and 0.015 < np.mean(low) < 0.08
+    assert groups.fitted(np.ones(2), np.ones(2)).p_value == 1.0

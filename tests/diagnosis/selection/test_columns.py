@@ -1,0 +1,95 @@
+"""Columns against differences of stock simulations, and what is offered at all."""
+
+import mujoco
+import numpy as np
+import pytest
+from plants import DRIVEN_PENDULUM, NOISE, recorded
+
+from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.selection.columns import Columns
+from diagnosis.selection.criterion import Evidence
+from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.simulation.simulator import World
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """(World, Ahead, Usual) of two runs of the pendulum with a friction that its model lacks."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded(f"{k}.csv", k, push=lambda t, q, v: -0.05 * np.tanh(v / 0.01)) for k in (0, 1)]
+    smoother = Smoother(world, runs)
+    trajectory = smoother.locate({}, passes=2)
+    ahead = Ahead(world, cut_ahead(runs), smoother.position_noise)
+    ahead.start(trajectory)
+    return world, ahead, Usual(world, runs, smoother.scale)
+
+
+def stock(ahead, window, damping=0.05, mass=0.5):
+    """qpos (T,) of one window in stock MuJoCo."""
+    model = mujoco.MjModel.from_xml_string(DRIVEN_PENDULUM.format(damping=damping, mass=mass))
+    data, w = mujoco.MjData(model), ahead.windows[window]
+    data.qpos[:], data.qvel[:] = ahead.qpos[window], ahead.qvel[window]
+    out = [data.qpos[0]]
+    for row in range(w.first, w.last):
+        data.ctrl[:] = w.recording.ctrl[row]
+        mujoco.mj_step(model, data, 2)
+        out.append(data.qpos[0])
+    return np.array(out)
+
+
+def test_a_column_is_what_the_prediction_gains_by_a_step_of_the_value(scene):
+    world, ahead, usual = scene
+    candidates = [world.candidate("viscous_damping", "pivot"), world.candidate("mass", "arm")]
+    columns = Columns(ahead, {}, usual, candidates)
+    for name, moved in (("viscous_damping", "damping"), ("mass", "mass")):
+        options = [o for o in columns.options if o.candidate.effect.name == name]
+        option = min(options, key=lambda o: abs(o.directions).max())
+        step = option.directions[0, 0]
+        for window in (0, 9):
+            ends = [stock(ahead, window, **{moved: option.base[0] + x}) for x in (step, 0.0)]
+            own = columns.array[window, : len(ends[0]), 0, option.columns[0]]
+            usable = ~columns.lost[window, : len(own), 0]
+            expected = (ends[0] - ends[1])[usable]
+            np.testing.assert_allclose(own[usable], expected, atol=1e-7)
+
+
+def test_nothing_outside_its_bounds_is_offered(scene):
+    world, ahead, usual = scene
+    candidates = [
+        c for c in world.candidates if c.place.kind in ("joint", "actuator") and not c.effect.timed
+    ]
+    columns = Columns(ahead, {}, usual, candidates)
+    evidence = Evidence(ahead, columns.residual, columns.array)
+    columns.secants(evidence)
+    assert len(columns.options) > 15
+    for option in columns.options:
+        prior, zero = plausible(option.candidate, usual), np.zeros(len(option.columns))
+        for amounts in (option.low, option.high, np.clip(zero + 1.0, option.low, option.high)):
+            finite = np.where(np.isfinite(amounts), amounts, 1e6 * np.sign(amounts))
+            values = np.array(option.values(finite))
+            assert (values >= prior.low - 1e-9).all() and (values <= prior.high + 1e-9).all()
+
+
+def test_effects_that_show_nowhere_are_left_out(scene):
+    world, ahead, usual = scene
+    candidates = [world.candidate("ground_height", g) for g in ()]
+    gravity = world.candidate("gravity", "world")
+    columns = Columns(ahead, {}, usual, candidates + [gravity])
+    sideways = [o for o in columns.options if (o.directions[:, 1] != 0).any()]
+    assert not sideways  # the pendulum turns about y
+
+
+def test_a_column_at_full_size_tells_friction_that_a_small_step_does_not(scene):
+    world, ahead, usual = scene
+    friction = world.candidate("coulomb_friction", "pivot")
+    columns = Columns(ahead, {}, usual, [friction])
+    losses = {}
+    evidence = Evidence(ahead, columns.residual, columns.array)
+    for option in columns.options:
+        score = evidence.score(option.columns, option.low, option.high, *option.quadratic())
+        losses[option.values(score.amounts)[0]] = score.loss
+    best = min(losses, key=losses.get)
+    assert best == pytest.approx(0.05, rel=0.3)
+    assert losses[best] < evidence.score((), *[np.zeros(0)] * 4).loss - 0.5
+    assert NOISE > 0
