@@ -1,0 +1,78 @@
+"""Priors in units of the machine: centred on the model, bounded by physics, dear where far off."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plants import DRIVEN_PENDULUM, arm, record, recorded
+from scipy import stats
+
+from diagnosis.selection.plausibility import TAIL, Prior, Usual, plausible, possible
+from diagnosis.simulation.simulator import World
+
+
+@pytest.fixture(scope="module", params=["motors", "servos"])
+def machine(request):
+    world, _ = arm(request.param)
+    return world, Usual(world, [record(world)], np.ones(world.model.nv))
+
+
+def test_every_effect_of_the_catalogue_has_a_prior_about_its_nominal_values(machine):
+    world, usual = machine
+    for c in world.candidates:
+        if c.place.kind == "sensor":
+            continue
+        prior, nominal = plausible(c, usual), np.array(c.nominal, float)
+        finite = np.isfinite(nominal)
+        assert (prior.centre[finite] == nominal[finite]).all(), c
+        assert (prior.low <= prior.high).all() and (prior.scale > 0).all(), c
+        assert prior.inside(np.where(finite, nominal, prior.high)), c
+        physical = [(p.low, p.high) for p in c.parameters]
+        for (low, high), own_low, own_high, n in zip(physical, prior.low, prior.high, nominal):
+            assert own_low >= min(low, n) and own_high <= max(high, n), c
+
+
+@given(st.lists(st.floats(-6, 6), min_size=2, max_size=2))
+@settings(max_examples=50, deadline=None)
+def test_costs_are_students_and_their_precision_leads_to_the_same_place(z):
+    scale, centre = np.array([0.5, 20.0]), np.array([1.0, -3.0])
+    prior = Prior(centre, scale, np.full(2, -np.inf), np.full(2, np.inf))
+    values, t = centre + scale * z, stats.t(TAIL)
+    assert prior.cost(values) == pytest.approx((t.logpdf(0) - t.logpdf(z)).sum(), abs=1e-9)
+    small = 1e-5 * scale
+    for k, unit in enumerate(np.eye(2)):
+        slope = (prior.cost(values + small * unit) - prior.cost(values - small * unit)) / (
+            2 * small[k]
+        )
+        pulled = prior.precision(values)[k] * (values - centre)[k]
+        assert pulled == pytest.approx(slope, abs=1e-4 / scale[k])
+
+
+def test_what_no_machine_has_is_not_possible():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    usual = Usual(world, [recorded("run.csv", 0)], np.array([0.5]))
+
+    def allowed(effect, place, *values):
+        candidate = world.candidate(effect, place)
+        return possible(candidate, np.array(values), plausible(candidate, usual))
+
+    assert allowed("mass", "arm", 0.9) and not allowed("mass", "arm", 875.0)
+    assert allowed("gain", "drive", 0.8) and not allowed("gain", "drive", 0.01)
+    inertia = world.model.dof_M0[0]
+    assert allowed("armature", "pivot", 0.5 * inertia)
+    assert not allowed("armature", "pivot", 89 * inertia)
+    assert allowed("gravity", "world", 1.0, 0.0, -9.76)  # tilted
+    assert not allowed("gravity", "world", 0.0, 0.0, -7.0)
+    assert not allowed("viscous_damping", "pivot", -0.1)
+
+
+def test_units_are_those_of_the_machine():
+    """Twice the force, twice what is usual of friction."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    friction = world.candidate("coulomb_friction", "pivot")
+    one, two = (
+        plausible(friction, Usual(world, [recorded("run.csv", 0)], np.array([f])))
+        for f in (0.5, 1.0)
+    )
+    assert two.scale == pytest.approx(2 * one.scale) and two.high == pytest.approx(2 * one.high)

@@ -1,0 +1,89 @@
+"""What a located force depends on: right on made-up motions, nothing on noise."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from diagnosis.estimation.smoother import Trajectory
+from diagnosis.recordings.recording import Recording
+from diagnosis.selection.unmodelled_force import dependences, knots_of
+from diagnosis.simulation.simulator import World
+
+ARM = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
+  <body><joint name="j" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"/>
+  <body pos="0 0 -.3"><joint name="k" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"/></body></body></worldbody>
+  <actuator><motor name="m" joint="j"/></actuator></mujoco>"""
+ROWS = 3000
+
+
+def made_up(law, noise=0.02, seed=0):
+    """(World, Trajectory, [Recording]) of two joints that swing, with a force law(q, v, u, time) (rows, 2)."""
+    rng, time = np.random.default_rng(seed), 0.01 * np.arange(ROWS)
+    rate, phase = rng.uniform(2, 6, (2, 3, 1, 2)) * [1, 1], rng.uniform(0, 6, (3, 1, 2))
+    angle = rate[0] * time[:, None] + phase
+    q, v = np.sin(angle).sum(0) / 2, (rate[0] * np.cos(angle)).sum(0) / 2
+    u = np.sin(rate[1][0, 0, 0] * 1.3 * time)[:, None]
+    force = law(q, v, u, time) + noise * rng.normal(size=(ROWS, 2))
+    run = Recording("run.csv", time, q, v, u)
+    sd = np.full((ROWS, 2), 1e-3)
+    free = np.zeros(ROWS, bool)
+    world = World(mujoco.MjSpec.from_string(ARM))
+    return world, Trajectory(q, v, force, sd, sd, sd, {run: 0}, free), [run]
+
+
+def at(joint, force):
+    out = np.zeros((ROWS, 2))
+    out[:, joint] = force
+    return out
+
+
+@pytest.mark.parametrize(
+    "law, joint, variable",
+    [
+        (lambda q, v, u, t: at(0, 0.3 * np.sin(4 * q[:, 0])), "j", "position:j"),
+        (lambda q, v, u, t: at(1, -0.2 * np.tanh(v[:, 1] / 0.1)), "k", "velocity:k"),
+        (lambda q, v, u, t: at(1, 0.2 * q[:, 0] ** 2), "k", "position:j"),
+        (lambda q, v, u, t: at(0, 0.3 * np.maximum(u[:, 0], 0)), "j", "control:m"),
+        (lambda q, v, u, t: at(0, 0.3 * np.tanh((t - 14) / 4)), "j", "time"),
+    ],
+)
+def test_the_variable_of_a_force_is_named_with_its_curve(law, joint, variable):
+    world, trajectory, runs = made_up(law)
+    found = dependences(world, trajectory, runs)[0]
+    assert (found.joint, found.variables[0]) == (joint, variable) and found.share > 0.8
+    knots, values = np.array(found.candidate.effect.knots), np.array(found.values)
+    q, v, u = trajectory.qpos, trajectory.qvel, runs[0].ctrl
+    x = {"position:j": q[:, 0], "velocity:k": v[:, 1], "control:m": u[:, 0]}.get(
+        variable, runs[0].time
+    )
+    dof = {"j": 0, "k": 1}[joint]
+    if len(found.variables) == 1:
+        curve = np.interp(x, knots, values)
+        true = law(q, v, u, runs[0].time)[:, dof]
+        assert np.sqrt(np.mean((curve - true) ** 2)) < 0.35 * np.sqrt(np.mean(true**2))
+        assert found.size == pytest.approx(np.sqrt(np.mean(true**2)), rel=0.2)
+
+
+def test_a_friction_over_the_travel_depends_on_position_and_on_the_sign_of_velocity():
+    law = lambda q, v, u, t: at(0, -0.2 * (1 + q[:, 0]) * np.sign(v[:, 0]))
+    found = dependences(*made_up(law))[0]
+    assert found.variables == ("position:j", "velocity:j") and found.share > 0.8
+
+
+def test_noise_depends_on_nothing():
+    for seed in range(5):
+        assert dependences(*made_up(lambda q, v, u, t: np.zeros((ROWS, 2)), seed=seed)) == []
+
+
+def test_rows_in_contact_are_left_out():
+    world, trajectory, runs = made_up(lambda q, v, u, t: at(0, 0.3 * np.sin(4 * q[:, 0])))
+    trajectory.free[:] = True
+    assert dependences(world, trajectory, runs) == []
+
+
+def test_knots_lie_close_about_standstill():
+    v = np.random.default_rng(0).normal(size=2000)
+    knots = knots_of(v, "velocity:j")
+    assert 0.0 in knots and min(np.diff(knots)) < 0.1 * max(np.diff(knots))
+    assert np.diff(knots_of(v, "position:j")) == pytest.approx(np.diff(knots_of(v, "time")))
