@@ -1,0 +1,111 @@
+"""Refits in the simulator recover what was put into stock MuJoCo; equals are told as a class."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.recordings.recording import Recording
+from diagnosis.selection import rivals
+from diagnosis.selection.criterion import paired
+from diagnosis.selection.judge import Judge
+from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.simulation.simulator import World
+
+PENDULUM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="arm">
+  <joint name="pivot" axis="0 1 0" damping="{damping}" frictionloss="{friction}"
+    solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="0.5" contype="0"/></body></worldbody>
+  <actuator><motor name="drive" joint="pivot" gear="{gear}"/></actuator></mujoco>"""
+
+
+def run(seed, damping=0.05, friction=0.0, gear=1.0, rows=800, noise=3e-4):
+    """A Recording of the pendulum in stock MuJoCo, rows 10 ms apart."""
+    rng = np.random.default_rng(seed)
+    xml = PENDULUM.format(damping=damping, friction=friction, gear=gear)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, time = mujoco.MjData(model), 0.01 * np.arange(rows)
+    period, phase = rng.uniform(0.6, 1.5, 3), rng.uniform(0, 6, 3)
+    ctrl = (0.3 * np.sin(2 * np.pi * time[:, None] / period + phase)).sum(1, keepdims=True)
+    qpos = np.empty((rows, 1))
+    for t in range(rows):
+        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
+        mujoco.mj_step(model, data, 5)
+    noisy = qpos + noise * rng.normal(size=qpos.shape)
+    return Recording(f"{seed}.csv", time, noisy, np.full(qpos.shape, np.nan), ctrl)
+
+
+def judge_of(**hidden):
+    """Judge on two runs of a pendulum whose model lacks what is hidden, begun at smoothed states."""
+    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, friction=0, gear=1)))
+    runs = [run(k, **hidden) for k in range(2)]
+    smoother = Smoother(world, runs)
+    trajectory = smoother.locate({}, passes=2)
+    ahead = Ahead(world, cut_ahead(runs), smoother.position_noise)
+    ahead.start(trajectory)
+    return Judge(ahead, Usual(world, runs, smoother.scale))
+
+
+def test_friction_and_gain_are_recovered_from_afar():
+    judge = judge_of(friction=0.06, gear=0.8)
+    friction, gain = (
+        judge.ahead.world.candidate(*c) for c in (("coulomb_friction", "pivot"), ("gain", "drive"))
+    )
+    fitted, bare = judge.fit({friction: (0.02,), gain: (1.0,)}), judge.fit({})
+    assert fitted.setting[friction][0] == pytest.approx(0.06, rel=0.02)
+    assert fitted.setting[gain][0] == pytest.approx(0.8, rel=0.02)
+    assert paired(bare.score, fitted.score).p_value < 1e-6
+    half = judge.fit({friction: (0.02,)})
+    assert fitted.loss < half.loss < bare.loss
+    assert paired(half.score, fitted.score).p_value < 1e-4
+
+
+def test_values_stay_inside_what_is_plausible():
+    judge = judge_of(friction=0.06)
+    gain = judge.ahead.world.candidate("gain", "drive")
+    prior = plausible(gain, judge.usual)
+    fitted = judge.fit({gain: (50.0,)})
+    assert prior.low[0] <= fitted.setting[gain][0] <= prior.high[0]
+
+
+def test_what_adds_nothing_does_not_earn_its_place():
+    judge = judge_of()
+    bare = judge.fit({})
+    for name, place in (("coulomb_friction", "pivot"), ("gain", "drive"), ("mass", "arm")):
+        candidate = judge.ahead.world.candidate(name, place)
+        start = np.array(candidate.nominal) + candidate.parameters[0].step
+        fitted = judge.fit({candidate: tuple(start)})
+        assert bare.loss - fitted.loss < 0.1, name
+
+
+def test_back_emf_and_viscous_damping_are_one_class():
+    judge = judge_of(damping=0.12)
+    world = judge.ahead.world
+    damping, back_emf = (
+        world.candidate(*c) for c in (("viscous_damping", "pivot"), ("back_emf", "drive"))
+    )
+    names = "viscous_damping", "back_emf", "coulomb_friction", "gain", "stiffness"
+    pool = [c for c in world.candidates if c.effect.name in names]
+    for found in (damping, back_emf):
+        fitted = judge.fit({found: (0.1,)})
+        again, others = rivals.classes(pool, judge, fitted)
+        [named] = again.setting
+        told = {named, *(c for c, _ in others[named])}
+        assert {damping, back_emf} <= told
+        assert named == damping  # the simplest stands first
+        assert again.loss < fitted.loss + 0.03
+        members = dict(others[named])
+        assert members[back_emf][0] == pytest.approx(0.07, rel=0.1)
+
+
+def test_what_is_no_equal_is_not_told():
+    judge = judge_of(friction=0.06)
+    world = judge.ahead.world
+    friction = world.candidate("coulomb_friction", "pivot")
+    fitted = judge.fit({friction: (0.05,)})
+    pool = [c for c in world.candidates if c.place.kind in ("joint", "actuator", "world", "body")]
+    again, others = rivals.classes(pool, judge, fitted)
+    assert list(again.setting) == [friction]
+    told = {c.effect.name for c, _ in others[friction]}
+    assert not told & {"gain", "stiffness", "mass", "delay", "viscous_damping", "gravity", "bias"}

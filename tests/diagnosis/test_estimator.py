@@ -1,0 +1,98 @@
+"""Whole diagnoses of a small pendulum that lacks something known, or nothing."""
+
+import mujoco
+import numpy as np
+import pytest
+from plants import DRIVEN_PENDULUM, NOISE, recorded
+
+from diagnosis.estimator import identify
+from diagnosis.recordings.recording import RecordingError
+from diagnosis.simulation.simulator import World
+
+
+def diagnosed(**hidden):
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded(f"run{i}.csv", i, **hidden) for i in range(3)]
+    return identify(world, runs[:2], runs[2:])
+
+
+def named(diagnosis):
+    return [(f["effect"], f["place"]["name"]) for f in diagnosis.summary["findings"]]
+
+
+def stock_error(xml, recording, noise):
+    """The reported error by a plain loop in stock MuJoCo."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, square = mujoco.MjData(model), []
+    q, time = recording.qpos[:, 0], recording.time
+    for first in range(0, len(time) - 30, 30):
+        mujoco.mj_resetData(model, data)
+        a, b = max(first - 1, 0), first + 1
+        data.qpos[:], data.qvel[:] = q[first], (q[b] - q[a]) / (time[b] - time[a])
+        for row in range(first, first + 30):
+            data.ctrl[:] = recording.ctrl[row]
+            mujoco.mj_step(model, data, 2)
+            square.append((data.qpos[0] - q[row + 1]) ** 2)
+    return np.sqrt(np.mean(square)) / noise
+
+
+def test_nothing_missing_is_a_match():
+    summary = diagnosed().summary
+    assert summary["verdict"] == "match" and not summary["findings"]
+    assert summary["fit"]["held_out"]["before"] == summary["fit"]["held_out"]["after"]
+    assert summary["unexplained"]["fraction"] == 0.0
+    assert summary["noise"]["qpos:pivot"] == pytest.approx(NOISE, rel=0.15)
+    assert summary["missing_force"]["pivot"]["rms"] < 1e-3
+
+
+def test_a_dry_friction_is_named_first_within_its_interval():
+    diagnosis = diagnosed(push=lambda time, q, v: -0.05 * np.tanh(v / 0.002))
+    summary = diagnosis.summary
+    assert summary["verdict"] == "mismatch" and named(diagnosis)[0] == ("coulomb_friction", "pivot")
+    [value] = summary["findings"][0]["parameters"]
+    assert value["value"] == pytest.approx(0.05, rel=0.02)
+    assert value["low"] < 0.0505 and 0.0495 < value["high"]
+    force = summary["missing_force"]["pivot"]
+    assert force["rms"] == pytest.approx(0.05, rel=0.2) and force["after"] < 0.2 * force["rms"]
+    assert force["depends_on"] == ["velocity:pivot"]
+
+
+def test_damping_is_named_and_the_corrected_file_reproduces_the_error():
+    diagnosis = diagnosed(damping=0.1)
+    assert named(diagnosis) == [("viscous_damping", "pivot")]
+    [value] = diagnosis.summary["findings"][0]["parameters"]
+    assert value["low"] < 0.1 < value["high"] and value["value"] == pytest.approx(0.1, rel=0.02)
+    fit = diagnosis.summary["fit"]["held_out"]
+    assert fit["after"] < 0.3 * fit["before"]
+    noise = diagnosis.summary["noise"]["qpos:pivot"]
+    assert stock_error(diagnosis.corrected_xml, diagnosis.held_out[0], noise) == pytest.approx(
+        fit["after"], rel=1e-3
+    )
+
+
+def test_two_effects_are_both_found():
+    diagnosis = diagnosed(damping=0.1, push=lambda time, q, v: 0.15)
+    found = [
+        {(f["effect"], f["place"]["name"])}
+        | {(a["effect"], a["place"]["name"]) for a in f["also_possible"]}
+        for f in diagnosis.summary["findings"]
+    ]
+    assert len(found) == 2
+    assert any(("viscous_damping", "pivot") in f for f in found)
+    assert any(("spring_offset", "pivot") in f for f in found)
+
+
+def test_what_no_catalogue_knows_is_called_unknown():
+    diagnosis = diagnosed(push=lambda time, q, v: -0.4 * np.sin(5 * q) * (q > 0))
+    first = diagnosis.summary["findings"][0]
+    assert (first["effect"], first["place"]["name"]) == ("unknown", "pivot")
+    assert "position:pivot" in first["depends_on"]
+    assert diagnosis.summary["verdict"] == "unresolved"
+
+
+def test_recordings_without_positions_are_refused():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    run = recorded("run.csv", 0)
+    run.qpos[:] = np.nan
+    with pytest.raises(RecordingError, match="not enough data"):
+        identify(world, [run], [])

@@ -1,0 +1,62 @@
+"""Nothing is handed over that predicts kept-back recordings worse, or that they do not need."""
+
+import mujoco
+import numpy as np
+import pytest
+from plants import DRIVEN_PENDULUM, NOISE, recorded
+
+from diagnosis.estimation import prediction_error
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.handover import Check, Files, accepted
+from diagnosis.simulation.simulator import World
+
+
+@pytest.fixture(scope="module")
+def kept_back():
+    """(World, Check) of a run with more damping than its model has."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded("held.csv", 7, damping=0.1, seconds=6.0)]
+    smoother = Smoother(world, runs)
+    smoother.locate({}, passes=1)
+    return world, Check(world, runs, smoother, {})
+
+
+def test_a_finding_that_predicts_worse_is_not_handed_over(kept_back):
+    world, check = kept_back
+    damping, spring = (
+        world.candidate(*c) for c in (("viscous_damping", "pivot"), ("stiffness", "pivot"))
+    )
+    handed = accepted(world, check, {damping: (0.1,), spring: (0.5,)})
+    assert set(handed.setting) == {damping}
+    assert handed.without[damping] == pytest.approx(check.error(Files.of(world, {})))
+    assert check.error(handed.files) < handed.without[damping]
+
+
+def test_findings_that_do_harm_together_all_go(kept_back):
+    world, check = kept_back
+    wrong = {world.candidate("bias", "drive"): (0.3,), world.candidate("gain", "drive"): (1.5,)}
+    handed = accepted(world, check, wrong)
+    assert handed.setting == {}
+    assert check.error(handed.files) == pytest.approx(check.error(handed.nominal))
+
+
+def test_the_error_of_the_files_is_that_of_the_simulator_that_fitted_them(kept_back):
+    world, check = kept_back
+    setting = {world.candidate("viscous_damping", "pivot"): (0.1,)}
+    for some in ({}, setting):
+        own = prediction_error.prediction_error(world, some, check.recordings, check.noise)[0]
+        assert check.error(Files.of(world, some)) == pytest.approx(own, rel=1e-4)
+
+
+def test_files_hold_what_mjcf_cannot_in_a_script():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    run = recorded("run.csv", 1, seconds=2.0)
+    zone = world.candidate("dead_zone", "drive")
+    smoother = Smoother(world, [run])
+    smoother.locate({}, passes=1)
+    check = Check(world, [run], smoother, {})
+    files = Files.of(world, {zone: (0.2,)})
+    assert files.forms == {zone: "python"} and files.python
+    own = prediction_error.prediction_error(world, {zone: (0.2,)}, [run], check.noise)[0]
+    assert check.error(files) == pytest.approx(own, rel=0.02)
+    assert np.isfinite(own) and NOISE > 0
