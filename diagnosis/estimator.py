@@ -144,9 +144,10 @@ def _strain(candidate, values, prior):
 
 def _hand_over(world, held, kept_back, outcome, log):
     """Fill in the Handed: what of the findings kept-back recordings need; the rest goes."""
-    setting = outcome.fitted.setting
-    check = Check(world, held, Smoother(world, held))
-    decides = check if kept_back is held else Check(world, kept_back, Smoother(world, kept_back))
+    setting, noise = outcome.fitted.setting, outcome.found.smoother.position_noise
+    check = decides = Check(world, held, Smoother(world, held), noise)
+    if kept_back is not held:
+        decides = Check(world, kept_back, Smoother(world, kept_back), noise)
     outcome.handed = accepted(world, decides, setting, log)
     kept = outcome.handed.setting
     if len(kept) < len(setting):
@@ -154,5 +155,5 @@ def _hand_over(world, held, kept_back, outcome, log):
     check.locate(kept)
     outcome.held_check = check
     smoother = outcome.found.smoother
-    outcome.train_check = Check(world, smoother.recordings, smoother)
+    outcome.train_check = Check(world, smoother.recordings, smoother, noise)
     outcome.train_check.trajectory = outcome.trajectory

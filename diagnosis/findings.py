@@ -48,7 +48,7 @@ def assemble(world, train, held_out, outcome):
     figures["held_out"]["horizon_s"] = cut.HORIZON
     check = outcome.held_check
     figures["held_out"]["curve"] = prediction_error.curve(
-        world, settings, check.smoother, check.trajectory
+        world, settings, check.smoother, check.trajectory, check.noise
     )
     if others := sensor_faults.errors(world, settings, check.recordings):
         figures["held_out"]["sensors"] = others
@@ -199,7 +199,7 @@ def _figure(world, handed: Handed, check, settings):
         for channel, value in per_channel.items():
             channels.setdefault(channel, {})[name] = value
     out["floor"], per_channel, check.scatter = prediction_error.floor_error(
-        world, settings, check.smoother, check.trajectory
+        world, settings, check.smoother, check.trajectory, check.noise
     )
     for channel, value in per_channel.items():
         channels[channel] |= {"floor": value, "unit": unit_of(model, channel)}

@@ -64,10 +64,11 @@ class Check:
     """Windows of recordings, as the contract's error has them, with a smoothed trajectory for its
     floor."""
 
-    def __init__(self, world, recordings, smoother):
+    def __init__(self, world, recordings, smoother, noise):
+        """noise (nv,): of positions, as it is reported, whatever these recordings alone show."""
         self.world, self.recordings, self.smoother = world, recordings, smoother
         self.windows = prediction_error.consecutive(recordings, cut.HORIZON)
-        self.noise = prediction_error.reporting_noise(smoother.position_noise)
+        self.noise = prediction_error.reporting_noise(noise)
         self.trajectory, self.scatter = None, 0.0
 
     def locate(self, setting):

@@ -82,7 +82,7 @@ def half_widths(evidence, index):
 
 
 def _curvature(evidence, index, weight, root):
-    """The loss's curvature (p, p) over that of least squares with fixed weights, in whitened columns.
+    """The loss's curvature (p, p) over that of weighted least squares, in whitened columns.
 
     The log of a cell's square bends less than the square itself, for a cell that errs much counts
     less: 1/2 log s has the second derivative X'X / ns - 2 X'r r'X / (ns)^2.

@@ -32,7 +32,7 @@ def prediction_error(world, settings, recordings, noise):
     return cut.error(world.model, windows, predict(world, settings, windows)[0], noise)
 
 
-def floor_error(world, settings, smoother, trajectory):
+def floor_error(world, settings, smoother, trajectory, noise):
     """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}),
     and how far the square of the
     former scatters between recordings of the same motion, noise being what it is (a standard
@@ -45,7 +45,6 @@ def floor_error(world, settings, smoother, trajectory):
         for name, dofs in cut.channels(world.model).items()
         if known[..., dofs].any()
     }
-    noise = reporting_noise(smoother.position_noise)
     total, count = (square / noise**2).sum((1, 2)).reshape(DRAWS, -1), max(known.sum(), 1)
     scatter = (
         np.sqrt(total.var(axis=0, ddof=1).sum()) * DRAWS / count
@@ -96,7 +95,7 @@ def reporting_noise(position_noise):
     return np.where(np.isfinite(position_noise), np.maximum(position_noise, 1e-12), 1.0)
 
 
-def curve(world, settings, smoother, trajectory, longest=3 * cut.HORIZON, points=15):
+def curve(world, settings, smoother, trajectory, noise, longest=3 * cut.HORIZON, points=15):
     """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t
     up to `longest`.
 
@@ -104,7 +103,6 @@ def curve(world, settings, smoother, trajectory, longest=3 * cut.HORIZON, points
     all that were measured
     then: "blown_up": {"before":, "after":, "of":}, where there are any.
     """
-    noise = reporting_noise(smoother.position_noise)
     windows = consecutive(smoother.recordings, longest)
     seconds = [w.recording.time[w.first : w.last + 1] - w.recording.time[w.first] for w in windows]
     sample = np.median([s[-1] / (len(s) - 1) for s in seconds])

@@ -18,7 +18,7 @@ def kept_back():
     runs = [recorded("held.csv", 7, damping=0.1, seconds=6.0)]
     smoother = Smoother(world, runs)
     smoother.locate({}, passes=1)
-    return world, Check(world, runs, smoother, {})
+    return world, Check(world, runs, smoother, smoother.position_noise)
 
 
 def test_a_finding_that_predicts_worse_is_not_handed_over(kept_back):
@@ -54,7 +54,7 @@ def test_files_hold_what_mjcf_cannot_in_a_script():
     zone = world.candidate("dead_zone", "drive")
     smoother = Smoother(world, [run])
     smoother.locate({}, passes=1)
-    check = Check(world, [run], smoother, {})
+    check = Check(world, [run], smoother, smoother.position_noise)
     files = Files.of(world, {zone: (0.2,)})
     assert files.forms == {zone: "python"} and files.python
     own = prediction_error.prediction_error(world, {zone: (0.2,)}, [run], check.noise)[0]

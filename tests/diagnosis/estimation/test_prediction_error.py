@@ -55,7 +55,7 @@ def test_windows_that_blow_up_are_counted_beside_the_curve():
 
     world.simulate = bursts
     mass = {world.candidate("mass", "arm"): (0.5001,)}
-    rows = prediction_error.curve(world, mass, smoother, trajectory)
+    rows = prediction_error.curve(world, mass, smoother, trajectory, np.array([NOISE]))
     assert [row["seconds"] > 0.405 for row in rows] == ["blown_up" in row for row in rows]
     assert rows[-1]["blown_up"] == {"before": 0, "after": 2, "of": 4}
     assert all(row["after"] == pytest.approx(row["before"], rel=0.5) for row in rows)
@@ -76,8 +76,8 @@ def test_the_curve_goes_by_time_whatever_the_sampling():
         )
     ]
     smoother = Smoother(world, [fast, *slower])
-    entries = prediction_error.curve(world, {}, smoother, smoother.locate({}))
-    noise = smoother.position_noise[0]
+    noise = np.array([NOISE])
+    entries = prediction_error.curve(world, {}, smoother, smoother.locate({}), noise)
     windows = prediction_error.consecutive([fast, *slower], 0.9)
     qpos = prediction_error.predict(world, {}, windows)[0]
     assert entries[-1]["seconds"] == pytest.approx(0.9, abs=0.05)
@@ -89,7 +89,7 @@ def test_the_curve_goes_by_time_whatever_the_sampling():
             if row and abs(time[row] - entry["seconds"]) < 0.021:
                 square.append((path[row, 0] - w.recording.qpos[w.first + row, 0]) ** 2)
         assert (
-            entry["before"] == pytest.approx(np.sqrt(np.mean(square)) / noise, rel=0.1)
+            entry["before"] == pytest.approx(np.sqrt(np.mean(square)) / NOISE, rel=0.1)
             and entry["floor"] > 0
         )
 
@@ -102,12 +102,11 @@ def test_floor_is_what_noise_does_to_a_perfect_simulator():
     )
     smoother = Smoother(world, runs)
     floor, channels, scatter = prediction_error.floor_error(
-        world, {}, smoother, smoother.locate({})
+        world, {}, smoother, smoother.locate({}), np.array([NOISE])
     )
-    noise = smoother.position_noise[0]
-    each = [stock_error(xml, run, noise) ** 2 for run in runs]
+    each = [stock_error(xml, run, NOISE) ** 2 for run in runs]
     assert floor == pytest.approx(np.sqrt(np.mean(each)), rel=0.08)
     assert np.std(each, ddof=1) / np.sqrt(len(each)) == pytest.approx(
         scatter, rel=0.7
     )  # known from six runs to 30 % itself
-    assert channels["qpos:pivot"] == pytest.approx(floor * noise)
+    assert channels["qpos:pivot"] == pytest.approx(floor * NOISE)

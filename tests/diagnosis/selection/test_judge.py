@@ -13,7 +13,8 @@ from diagnosis.selection.judge import Judge
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.simulator import World
 
-PENDULUM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="arm">
+PENDULUM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <body name="arm">
   <joint name="pivot" axis="0 1 0" damping="{damping}" frictionloss="{friction}"
     solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"/>
   <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="0.5" contype="0"/></body></worldbody>
@@ -37,7 +38,7 @@ def run(seed, damping=0.05, friction=0.0, gear=1.0, rows=800, noise=3e-4):
 
 
 def judge_of(**hidden):
-    """Judge on two runs of a pendulum whose model lacks what is hidden, begun at smoothed states."""
+    """Judge on two runs of a pendulum whose model lacks what is hidden."""
     world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, friction=0, gear=1)))
     runs = [run(k, **hidden) for k in range(2)]
     smoother = Smoother(world, runs)

@@ -18,7 +18,7 @@ ROWS = 3000
 
 
 def made_up(law, noise=0.02, seed=0):
-    """(World, Trajectory, [Recording]) of two joints that swing, with a force law(q, v, u, time) (rows, 2)."""
+    """(World, Trajectory, [Recording]) of two joints that swing, with a force law (rows, 2)."""
     rng, time = np.random.default_rng(seed), 0.01 * np.arange(ROWS)
     rate, phase = rng.uniform(2, 6, (2, 3, 1, 2)) * [1, 1], rng.uniform(0, 6, (3, 1, 2))
     angle = rate[0] * time[:, None] + phase
