@@ -90,6 +90,18 @@ def test_what_no_catalogue_knows_is_called_unknown():
     assert diagnosis.summary["verdict"] == "unresolved"
 
 
+def test_a_push_for_a_while_is_placed_in_time():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [
+        recorded("calm.csv", 0),
+        recorded("pushed.csv", 1, push=lambda time, q, v: 0.5 * (1.5 < time < 2.5)),
+        recorded("held.csv", 2),
+    ]
+    [finding] = identify(world, runs[:2], runs[2:]).summary["findings"]
+    assert finding["when"]["recording"] == "pushed.csv"
+    assert finding["when"]["time"] == pytest.approx([1.5, 2.5], abs=0.1)
+
+
 def test_recordings_without_positions_are_refused():
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     run = recorded("run.csv", 0)
