@@ -3,9 +3,9 @@
     python benchmarks/coverage.py [--trials 100] [--first 0]
 
 Each trial hides two effects in a small pendulum (of damping, dry friction, gain, mass and a spring,
-with values, noise and excitation drawn from the seed), records it in stock MuJoCo at the model's own
-step or four times finer, refits just these two, and asks which intervals hold the truth. A row per
-parameter; rows of seeds that are run again are replaced.
+with values, noise and excitation drawn from the seed), records it in stock MuJoCo at the model's
+own step or four times finer, refits just these two, and asks which intervals hold the truth. A row
+per parameter; rows of seeds that are run again are replaced.
 """
 
 import argparse

@@ -2,10 +2,10 @@
 
     python benchmarks/power.py [--trials 200]
 
-Residuals that windows of a group have in common (half of their square) and columns of the same kind;
-an effect of `size` noises is in the residual. accepted: the paired comparison's p-value is below the
-level; looked_at: of so many columns, all but one of them empty, the best is taken and its p-value is
-multiplied by their number. At size 0 this is the rate of false alarms.
+Residuals that windows of a group have in common (half of their square) and columns of the same
+kind; an effect of `size` noises is in the residual. accepted: the paired comparison's p-value is
+below the level; looked_at: of so many columns, all but one of them empty, the best is taken and its
+p-value is multiplied by their number. At size 0 this is the rate of false alarms.
 """
 
 import argparse

@@ -47,6 +47,8 @@ def test_residuals_are_those_of_stock_steps_and_what_is_lost_is_no_farther_than_
                 gap = np.clip(gap, -ahead.travel[0], ahead.travel[0])
                 assert both[setting, k, row - w.first, 0] == pytest.approx(gap, abs=1e-9)
     true = here.simulate
+    here.simulate = lambda *a, **k: [x + 100.0 for x in true(*a, **k)]
+    assert (ahead.residual([{}])[0][ahead.known] == -ahead.travel[0]).all()
     here.simulate = lambda *a, **k: [np.full_like(x, np.nan) for x in true(*a, **k)]
     lost = ahead.residual([{}])[0]
     assert (lost[ahead.known] == ahead.travel[0]).all() and (lost[~ahead.known] == 0).all()
