@@ -81,6 +81,8 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         found = search.run()
     say(0.75, "what could stand in a finding's place")
     fitted, others = rivals.classes(search.candidates, found.judge, found.fitted, log)
+    if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
+        fitted = search.pruned(found.judge, fitted)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
     outcome.event, outcome.earned = event, bool(outcome.fitted.setting or event)
