@@ -83,14 +83,13 @@ class Ahead:
         """Begin the windows at a Trajectory's states."""
         self.qpos, self.qvel = trajectory.at(self.windows)
 
-    def residual(self, settings):
+    def residual(self, settings, refine=1):
         """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther
-        than the travel."""
+        than the travel. refine: the model's time step is divided by it."""
         n, W = len(settings), len(self.windows)
         each = [s for s in settings for _ in range(W)]
-        qpos = self.world.simulate(
-            each, np.tile(self.qpos, (n, 1)), np.tile(self.qvel, (n, 1)), self.windows * n
-        )[0]
+        starts = np.tile(self.qpos, (n, 1)), np.tile(self.qvel, (n, 1))
+        qpos = self.world.simulate(each, *starts, self.windows * n, refine)[0]
         out = np.empty((n, *self.known.shape))
         for k in range(n):
             with np.errstate(invalid="ignore", over="ignore"):

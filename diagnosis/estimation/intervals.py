@@ -1,18 +1,15 @@
-"""95 % intervals that allow for dependence within groups of windows and for few groups.
+"""95 % intervals that allow for dependence within groups, for few groups, and for the time step.
 
 bounds = intervals(fitted)          # {candidate: [(low, high) or None, ...]}
 
 The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees
-of
-freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipton, JBES 36 (2018).
+of freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipton, JBES 36 (2018).
 """
 
 import numpy as np
 from scipy import stats
 
-SHARED = (
-    0.01  # of a direction that is not seen, the part from which on a column's value is not told
-)
+SHARED = 0.01  # of a direction that is not seen, the part beyond which a value is not told
 FLAT = 0.2  # of the squares' curvature, the least that the loss's is taken for
 UNSEEN = 1e-8  # share of a column's information that the others leave, below which it is not seen
 
@@ -24,6 +21,7 @@ def intervals(fitted):
     options = fitted.columns.options
     index = np.concatenate([[0], *[np.array(o.columns) + 1 for o in options]]).astype(int)
     half, shift = half_widths(evidence, index)
+    finer = step_error(fitted, index)
     at = 0
     for c, values in fitted.setting.items():
         out[c] = [None] * len(values)
@@ -32,15 +30,40 @@ def intervals(fitted):
             continue
         for row in option.directions:
             k = int(np.flatnonzero(row)[0])
-            width = (half[at] + abs(shift[at])) * abs(row[k])  # a refit ends short of its optimum
+            middle = values[k] + shift[at] * row[k]
+            width, more = half[at] * abs(row[k]), finer[at] * row[k]
             if np.isfinite(width):
-                low, high = option.prior.low[k], option.prior.high[k]
-                out[c][k] = (
-                    float(max(values[k] - width, low)),
-                    float(min(values[k] + width, high)),
-                )
+                low, high = middle - width + min(more, 0.0), middle + width + max(more, 0.0)
+                prior = option.prior
+                out[c][k] = (float(max(low, prior.low[k])), float(min(high, prior.high[k])))
             at += 1
     return out
+
+
+def step_error(fitted, index):
+    """How far ever smaller time steps would move the amounts of columns index[1:], (p,).
+
+    What half the step changes is one more column. A real machine has no step, which is twice that
+    change, as far as the recordings can hold so much of it.
+    """
+    columns, p = fitted.columns, len(index) - 1
+    if not p:
+        return np.zeros(0)
+    halved = columns.ahead.residual([fitted.setting], refine=2)[0]
+    change = np.where(columns.lost, 0.0, columns.residual - halved)
+    stack = np.concatenate([columns.array[..., index[1:] - 1], change[..., None]], -1)
+    kind = type(fitted.evidence)  # of a floor above this one
+    evidence = kind(columns.ahead, columns.residual, stack, fitted.evidence.floor)
+    every = np.arange(p + 2)
+    half, amounts = half_widths(evidence, every)
+    most = np.clip(amounts[-1] + half[-1], 0.0, 2.0)
+    whole = np.einsum("gc,gcij->ij", evidence._weight(every, np.zeros(p + 1)), evidence.gram)[
+        1:, 1:
+    ]
+    scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    even = whole / np.outer(scale, scale)
+    inside = even[:p, :p] + UNSEEN * np.eye(p)
+    return -most * np.linalg.solve(inside, even[:p, p]) * scale[p] / scale[:p]
 
 
 def half_widths(evidence, index):
