@@ -8,6 +8,7 @@ predicted
 
 import numpy as np
 
+from diagnosis.effects.base import runge_kutta
 from diagnosis.estimation import windows as cut
 
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
@@ -83,12 +84,13 @@ class Ahead:
         """Begin the windows at a Trajectory's states."""
         self.qpos, self.qvel = trajectory.at(self.windows)
 
-    def residual(self, settings, refine=1):
+    def residual(self, settings, refine=1, qvel=None):
         """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther
-        than the travel. refine: the model's time step is divided by it."""
+        than the travel. refine: the time step is divided by it; qvel (W, nv): other starts."""
         n, W = len(settings), len(self.windows)
         each = [s for s in settings for _ in range(W)]
-        starts = np.tile(self.qpos, (n, 1)), np.tile(self.qvel, (n, 1))
+        qvel = self.qvel if qvel is None else qvel
+        starts = np.tile(self.qpos, (n, 1)), np.tile(qvel, (n, 1))
         qpos = self.world.simulate(each, *starts, self.windows * n, refine)[0]
         out = np.empty((n, *self.known.shape))
         for k in range(n):
@@ -97,3 +99,18 @@ class Ahead:
             gap = np.where(np.isfinite(gap), np.clip(gap, -self.travel, self.travel), self.travel)
             out[k] = np.where(self.known, gap, 0.0)
         return out
+
+    def halved(self, setting):
+        """The residual (W, T, nv) of a setting with half the time step.
+
+        Where positions move by a step's new velocity, a velocity is that of half a step before its
+        time; with half the step it is a quarter of a step later.
+        """
+        steps = [v[0] for c, v in setting.items() if c.effect.name == "time_step"]
+        late = (steps[0] if steps else self.model.opt.timestep) / 4
+        if runge_kutta(self.model):
+            late = 0.0
+        W = len(self.windows)
+        qvel = self.world.simulate([setting] * W, self.qpos, self.qvel, self.windows)[1]
+        gained = np.nan_to_num((qvel[:, 1] - qvel[:, 0]) / self.seconds[:, 1:2])
+        return self.residual([setting], refine=2, qvel=self.qvel + late * gained)[0]

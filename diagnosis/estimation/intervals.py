@@ -3,7 +3,8 @@
 bounds = intervals(fitted)          # {candidate: [(low, high) or None, ...]}
 
 The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees
-of freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipton, JBES 36 (2018).
+of freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipton, Journal of
+Business and Economic Statistics 36 (2018).
 """
 
 import numpy as np
@@ -11,17 +12,16 @@ from scipy import stats
 
 SHARED = 0.01  # of a direction that is not seen, the part beyond which a value is not told
 FLAT = 0.2  # of the squares' curvature, the least that the loss's is taken for
+ENDLESS = 2.0  # times what half the step changes: steps that are ever smaller
 UNSEEN = 1e-8  # share of a column's information that the others leave, below which it is not seen
 
 
 def intervals(fitted):
     """{candidate: [(low, high), ...]} of a Fitted set; None for a parameter that the recordings do
     not show."""
-    evidence, out = fitted.evidence, {}
-    options = fitted.columns.options
+    out, options = {}, fitted.columns.options
     index = np.concatenate([[0], *[np.array(o.columns) + 1 for o in options]]).astype(int)
-    half, shift = half_widths(evidence, index)
-    finer = step_error(fitted, index)
+    middle, half = without_step(fitted, index)
     at = 0
     for c, values in fitted.setting.items():
         out[c] = [None] * len(values)
@@ -30,40 +30,46 @@ def intervals(fitted):
             continue
         for row in option.directions:
             k = int(np.flatnonzero(row)[0])
-            middle = values[k] + shift[at] * row[k]
-            width, more = half[at] * abs(row[k]), finer[at] * row[k]
-            if np.isfinite(width):
-                low, high = middle - width + min(more, 0.0), middle + width + max(more, 0.0)
-                prior = option.prior
-                out[c][k] = (float(max(low, prior.low[k])), float(min(high, prior.high[k])))
+            ends = values[k] + row[k] * np.array([middle[at] - half[at], middle[at] + half[at], 0])
+            if np.isfinite(ends).all():
+                low, high = (
+                    max(min(ends), option.prior.low[k]),
+                    min(max(ends), option.prior.high[k]),
+                )
+                out[c][k] = (float(low), float(high))
             at += 1
     return out
 
 
-def step_error(fitted, index):
-    """How far ever smaller time steps would move the amounts of columns index[1:], (p,).
+def without_step(fitted, index):
+    """Middles and half widths (p,) of the amounts of columns index[1:], the time step being free.
 
-    What half the step changes is one more column. A real machine has no step, which is twice that
-    change, as far as the recordings can hold so much of it.
+    What half the step changes is one more column, of which a world without steps holds twice the
+    amount; where the recordings do not tell it from the others, it may be anything up to that.
     """
     columns, p = fitted.columns, len(index) - 1
+    half, moves = half_widths(fitted.evidence, index)
     if not p:
-        return np.zeros(0)
-    halved = columns.ahead.residual([fitted.setting], refine=2)[0]
-    change = np.where(columns.lost, 0.0, columns.residual - halved)
+        return moves, half
+    change = columns.residual - columns.ahead.halved(fitted.setting)
+    change = np.where(columns.lost, 0.0, change)
     stack = np.concatenate([columns.array[..., index[1:] - 1], change[..., None]], -1)
     kind = type(fitted.evidence)  # of a floor above this one
     evidence = kind(columns.ahead, columns.residual, stack, fitted.evidence.floor)
     every = np.arange(p + 2)
-    half, amounts = half_widths(evidence, every)
-    most = np.clip(amounts[-1] + half[-1], 0.0, 2.0)
-    whole = np.einsum("gc,gcij->ij", evidence._weight(every, np.zeros(p + 1)), evidence.gram)[
-        1:, 1:
-    ]
+    wide, amounts = half_widths(evidence, every)
+    weight = evidence._weight(every, np.zeros(p + 1))
+    whole = np.einsum("gc,gcij->ij", weight, evidence.gram)[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     even = whole / np.outer(scale, scale)
     inside = even[:p, :p] + UNSEEN * np.eye(p)
-    return -most * np.linalg.solve(inside, even[:p, p]) * scale[p] / scale[:p]
+    each = -np.linalg.solve(inside, even[:p, p]) * scale[p] / scale[:p]
+    told = np.isfinite(wide[:p])
+    amount = np.clip(amounts[p], 0.0, ENDLESS) if np.isfinite(wide[p]) else 0.0
+    return (
+        moves + np.where(told, amount, ENDLESS / 2) * each,
+        np.where(told, wide[:p], half + ENDLESS / 2 * abs(each)),
+    )
 
 
 def half_widths(evidence, index):

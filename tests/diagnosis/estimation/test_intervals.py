@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from interval_coverage import trial
 from synthetic import clustered, evidence_of, free, scene
 
 from diagnosis.estimation import groups
@@ -43,6 +44,14 @@ def test_noise_without_groups_gives_the_textbooks_interval():
     residual = rng.normal(size=ahead.known.shape)
     _, half = fitted(ahead, residual, columns)
     assert half == pytest.approx(1.96 / np.sqrt(residual.size), rel=0.3)
+
+
+def test_intervals_hold_the_truth_of_a_world_with_finer_steps():
+    """Where they missed it while the step was taken for the world's."""
+    rows = [row for seed in (13, 19, 34) for row in trial(seed, 4)]
+    assert sum(row["inside"] for row in rows) == len(rows) == 6
+    width = [(float(r["high"]) - float(r["low"])) / float(r["truth"]) for r in rows]
+    assert np.median(width) < 0.05
 
 
 def test_what_others_do_as_well_has_no_interval():

@@ -1,6 +1,6 @@
 """Do 95 % intervals cover where the structure is right? results/coverage.csv.
 
-    python benchmarks/coverage.py [--trials 100] [--first 0]
+    python benchmarks/interval_coverage.py [--trials 100] [--first 0]
 
 Each trial hides two effects in a small pendulum (of damping, dry friction, gain, mass and a spring,
 with values, noise and excitation drawn from the seed), records it in stock MuJoCo at the model's
@@ -66,12 +66,13 @@ def record(rng, values, noise, finer, name, rows=600):
     return Recording(name, time, noisy, np.full(qpos.shape, np.nan), ctrl)
 
 
-def trial(seed):
-    """Rows of one trial."""
+def trial(seed, finer=None):
+    """Rows of one trial; finer: how often the truth's step goes into the model's."""
     rng, begun = np.random.default_rng(seed), clock.process_time()
     hidden = sorted(rng.choice(sorted(HIDDEN), 2, replace=False))
     values = {a: float(rng.uniform(*HIDDEN[a][2])) for a in hidden}
-    noise, finer = float(10 ** rng.uniform(-4, -2.7)), int(rng.choice([1, 4]))
+    noise, drawn = float(10 ** rng.uniform(-4, -2.7)), int(rng.choice([1, 4]))
+    finer = finer or drawn
     world = World(mujoco.MjSpec.from_string(XML.format(**NOMINAL)))
     runs = [record(rng, {**NOMINAL, **values}, noise, finer, f"{k}.csv") for k in range(2)]
     smoother = Smoother(world, runs)
