@@ -53,7 +53,7 @@ class Ahead:
         number = min(GROUPS, len(windows))
         self.group = np.arange(len(windows)) * number // len(windows)
         self.channels = list(cut.channels(self.model).values())
-        self.noise = noise
+        self.noise, self.step = noise, self.model.opt.timestep
         self.travel = self._travel()
         self.qpos, self.qvel = cut.recorded_starts(self.model, windows)
 
@@ -83,15 +83,17 @@ class Ahead:
     def start(self, trajectory):
         """Begin the windows at a Trajectory's states."""
         self.qpos, self.qvel = trajectory.at(self.windows)
+        self.step = trajectory.step or self.model.opt.timestep
 
-    def residual(self, settings, refine=1, qvel=None):
+    def residual(self, settings, refine=1):
         """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther
-        than the travel. refine: the time step is divided by it; qvel (W, nv): other starts."""
+        than the travel. refine: the time step is divided by it."""
         n, W = len(settings), len(self.windows)
         each = [s for s in settings for _ in range(W)]
-        qvel = self.qvel if qvel is None else qvel
-        starts = np.tile(self.qpos, (n, 1)), np.tile(qvel, (n, 1))
-        qpos = self.world.simulate(each, *starts, self.windows * n, refine)[0]
+        qvel = np.concatenate([self._velocities(s, refine) for s in settings])
+        qpos = self.world.simulate(
+            each, np.tile(self.qpos, (n, 1)), qvel, self.windows * n, refine
+        )[0]
         out = np.empty((n, *self.known.shape))
         for k in range(n):
             with np.errstate(invalid="ignore", over="ignore"):
@@ -100,17 +102,18 @@ class Ahead:
             out[k] = np.where(self.known, gap, 0.0)
         return out
 
-    def halved(self, setting):
-        """The residual (W, T, nv) of a setting with half the time step.
+    def _velocities(self, setting, refine):
+        """Start velocities (W, nv) for the time step of a setting.
 
         Where positions move by a step's new velocity, a velocity is that of half a step before its
-        time; with half the step it is a quarter of a step later.
+        time: with a shorter step it is a later one than that which was located.
         """
         steps = [v[0] for c, v in setting.items() if c.effect.name == "time_step"]
-        late = (steps[0] if steps else self.model.opt.timestep) / 4
-        if runge_kutta(self.model):
-            late = 0.0
-        W = len(self.windows)
-        qvel = self.world.simulate([setting] * W, self.qpos, self.qvel, self.windows)[1]
-        gained = np.nan_to_num((qvel[:, 1] - qvel[:, 0]) / self.seconds[:, 1:2])
-        return self.residual([setting], refine=2, qvel=self.qvel + late * gained)[0]
+        step = (steps[0] if steps else self.model.opt.timestep) / refine
+        if step == self.step or runge_kutta(self.model):
+            return self.qvel
+        rest = {c: v for c, v in setting.items() if c.effect.name != "time_step"}
+        short = [w._replace(last=w.first + 1) for w in self.windows]
+        qvel = self.world.simulate([rest] * len(short), self.qpos, self.qvel, short)[1]
+        gained = (qvel[:, 1] - qvel[:, 0]) / self.seconds[:, 1:2]
+        return self.qvel + (self.step - step) / 2 * np.where(np.isfinite(gained), gained, 0.0)

@@ -51,7 +51,7 @@ def without_step(fitted, index):
     half, moves = half_widths(fitted.evidence, index)
     if not p:
         return moves, half
-    change = columns.residual - columns.ahead.halved(fitted.setting)
+    change = columns.residual - columns.ahead.residual([fitted.setting], refine=2)[0]
     change = np.where(columns.lost, 0.0, change)
     stack = np.concatenate([columns.array[..., index[1:] - 1], change[..., None]], -1)
     kind = type(fitted.evidence)  # of a floor above this one
