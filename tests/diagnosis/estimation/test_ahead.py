@@ -8,6 +8,7 @@ import pytest
 from plants import DRIVEN_PENDULUM, NOISE, recorded
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.smoother import Smoother
 from diagnosis.simulation.simulator import World
 
 XML = DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)
@@ -64,3 +65,15 @@ def test_bands_are_of_time_ahead_and_unmeasured_rows_count_nowhere():
         assert (ahead.band[inside] == band).all()
     assert (ahead.band[:, 0] == -1).all()
     assert sorted(set(ahead.group)) == list(range(16)) and (np.diff(ahead.group) >= 0).all()
+
+
+def test_a_shorter_step_begins_with_the_velocity_of_a_later_time():
+    """From the same motion located at the model's step, a world with finer steps is predicted."""
+    here, run = world(), recorded("fine.csv", 4, seconds=8.0, finer=8, noise=1e-6)
+    smoother = Smoother(here, [run])
+    ahead = Ahead(here, cut_ahead([run]), np.array([NOISE]))
+    ahead.start(smoother.locate({}))
+    step = here.candidate("time_step", "world")
+    coarse, fine = (np.sqrt(np.mean(r**2)) for r in ahead.residual([{}, {step: (0.00125,)}]))
+    assert fine < 0.35 * coarse
+    assert np.sqrt(np.mean(ahead.residual([{}], refine=4) ** 2)) == pytest.approx(fine, rel=1e-6)
