@@ -22,7 +22,7 @@ TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 # unit
 #   used: share of the largest force asked for     gone: share of the recorded travel
 TABLE = {
-    "mass": [("times", 0.4, 0.3, 3.0)],
+    "mass": [("times", 0.4, 0.05, 30.0)],
     "payload_change": [("times", 0.4, 0.3, 3.0)],
     "center_of_mass": [("size", 0.3, -1.5, 1.5)],
     "inertia": [("times", 0.4, 0.25, 4.0)],
