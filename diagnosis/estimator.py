@@ -75,6 +75,8 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         [(found.fitted.setting, found.trajectory), ({}, found.first)],
         found.smoother.position_noise,
     )
+    if event and not plausible(event.candidate, found.usual).inside(np.array(event.values)):
+        event = None
     if event:  # what lasts is searched again where it was not disturbed
         log(f"  an event: {event.candidate}")
         search = Identification(world, transients.calm(train, event), say, log)

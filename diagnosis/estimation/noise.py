@@ -49,6 +49,8 @@ def difference_noise(time, column):
         if not estimates:
             break
         best = min(estimates)
+        if len(estimates) > 2:  # what still falls with the order is motion, and falls on
+            best *= min(1.0, estimates[-1] / estimates[-3]) ** 2
         if len(estimates) < len(ORDERS) or estimates[-1] > WHITE * estimates[1]:
             break
     step = quantum(column)

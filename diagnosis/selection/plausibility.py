@@ -85,6 +85,7 @@ AWAY = (
     "external_force",
     "wind",
 )
+PUSH = 20.0  # times what may last: what acts for a while may be larger
 STRENGTH = 0.04  # share by which gravity's strength may differ from the model's
 
 
@@ -175,6 +176,7 @@ def plausible(candidate, usual):
     parameters allow."""
     parameters = candidate.parameters
     nominal = np.array([p.nominal for p in parameters], float)
+    passing = PUSH if candidate.when else 1.0
     rows = TABLE.get(candidate.effect.name, [("plain", np.inf, -np.inf, np.inf)])
     rows = rows if len(rows) == len(parameters) else rows * len(parameters)
     scale, low, high = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
@@ -182,7 +184,7 @@ def plausible(candidate, usual):
         ratio = kind == "times"
         unit = abs(nominal[k]) if ratio else usual.unit(kind, candidate)
         shift = nominal[k] if candidate.effect.name in AWAY else 0.0
-        ends = np.array([a, b]) * unit + shift if np.isfinite(unit) else (-np.inf, np.inf)
+        ends = np.array([a, b]) * unit * passing + shift if np.isfinite(unit) else (-np.inf, np.inf)
         scale[k] = s * unit if np.isfinite(s * unit) and s * unit > 0 else np.inf
         low[k], high[k] = max(min(ends), parameters[k].low), min(max(ends), parameters[k].high)
         if np.isfinite(nominal[k]):
