@@ -152,10 +152,12 @@ def _hand_over(world, held, kept_back, outcome, log):
     check = decides = Check(world, held, Smoother(world, held), noise)
     if kept_back is not held:
         decides = Check(world, kept_back, Smoother(world, kept_back), noise)
-    outcome.handed = accepted(world, decides, setting, log)
+    judge = outcome.found.judge
+    refit = lambda some: judge.fit(some, steps=3).setting
+    outcome.handed = accepted(world, decides, setting, refit, log)
     kept = outcome.handed.setting
     if len(kept) < len(setting):
-        outcome.fitted = outcome.found.judge.fit(kept, steps=0)
+        outcome.fitted = judge.fit(kept, steps=0)
     check.locate(kept)
     outcome.held_check = check
     smoother = outcome.found.smoother

@@ -97,10 +97,10 @@ class Check:
             return np.inf
 
 
-def accepted(world, check, setting, log=lambda what: None):
+def accepted(world, check, setting, refit=lambda setting: setting, log=lambda what: None):
     """The Handed of what of a setting earns its place on kept-back recordings: together better than
     the nominal
-    model, and each finding better with than without."""
+    model, and each finding better with than without. refit(setting): what is left, fitted again."""
     nominal = Files.of(world, {})
     before = check.error(nominal)
     while True:
@@ -115,4 +115,4 @@ def accepted(world, check, setting, log=lambda what: None):
         if worst is None or without[worst] > after and after < before:
             return Handed(setting, files, nominal, without)
         log(f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with")
-        setting = {c: v for c, v in setting.items() if c is not worst}
+        setting = refit({c: v for c, v in setting.items() if c is not worst})

@@ -58,7 +58,8 @@ class Option:
 
     def quadratic(self):
         """(precision, pull) (p,) of the prior about the base, for the criterion."""
-        k = np.array(self.prior.precision(self.base))
+        # where the start is: far out a Student's t bends little
+        k = np.array(self.prior.precision(self.base + self.directions.sum(0)))
         precision = (self.directions**2 * k).sum(1)
         pull = -(self.directions * k * (self.base - self.prior.centre)).sum(1)
         return precision, pull
