@@ -64,11 +64,12 @@ def without_step(fitted, index):
     even = whole / np.outer(scale, scale)
     inside = even[:p, :p] + UNSEEN * np.eye(p)
     each = -np.linalg.solve(inside, even[:p, p]) * scale[p] / scale[:p]
-    told = np.isfinite(wide[:p])
+    most = half + ENDLESS / 2 * abs(each)  # the step can do no more than that, told or not
+    told = np.isfinite(wide[:p]) & (wide[:p] <= most)
     amount = np.clip(amounts[p], 0.0, ENDLESS) if np.isfinite(wide[p]) else 0.0
     return (
         moves + np.where(told, amount, ENDLESS / 2) * each,
-        np.where(told, wide[:p], half + ENDLESS / 2 * abs(each)),
+        np.where(told, wide[:p], most),
     )
 
 
