@@ -28,6 +28,7 @@ from diagnosis.effects.joints import (
 
 # share by which friction at rest is larger than that of motion, at least, that it is called
 # Stribeck's
+MOST_FALL = 5.0  # times the friction of motion, that of rest at most: dry surfaces reach 2 to 3
 FALLS = 0.05
 SELF_LOCKING = 2.0  # share of the load beyond which no drive would turn
 CYCLES = 1.0, 2.0, 3.0  # of a friction map over the travel, to try first
@@ -80,8 +81,8 @@ class StribeckFriction(JointEffect):
         return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
 
     def possible(self, values, nominal):
-        """It falls with speed, by enough to matter."""
-        return values[1] > (1 + FALLS) * values[0]
+        """It falls with speed, by enough to matter, and not to nothing."""
+        return (1 + FALLS) * values[0] < values[1] <= MOST_FALL * values[0]
 
     def edit(self, model, i, values):
         CoulombFriction().edit(model, i, values[1:2])
