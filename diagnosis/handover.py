@@ -6,7 +6,7 @@ handed.files.xml, handed.setting
 """
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -38,7 +38,11 @@ class Files:
         """qpos (W, T, nq) of windows, by stock MuJoCo and the script; NaN where there is none."""
         if not self.python:
             return stock.predicted(stock.compiled(self.xml), nominal, windows)
-        out = np.full(cut.measured(windows).shape, np.nan)
+        out, filled = np.full(cut.measured(windows).shape, np.nan), {}
+        for r in cut.recordings_of(windows):  # where a window begins in a hole
+            qpos, qvel = cut.states(nominal, r)
+            filled[r] = replace(r, qpos=qpos, qvel=qvel)
+        windows = [w._replace(recording=filled[w.recording]) for w in windows]
         with tempfile.TemporaryDirectory() as folder:
             Path(folder, "corrected.xml").write_text(self.xml, encoding="utf-8")
             script = Path(folder, "corrected.py")

@@ -60,3 +60,13 @@ def test_files_hold_what_mjcf_cannot_in_a_script():
     own = prediction_error.prediction_error(world, {zone: (0.2,)}, [run], check.noise)[0]
     assert check.error(files) == pytest.approx(own, rel=0.02)
     assert np.isfinite(own) and NOISE > 0
+
+
+def test_a_window_that_begins_in_a_hole_of_the_recording_is_predicted_by_the_script_too():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    run = recorded("run.csv", 1, seconds=2.0)
+    smoother = Smoother(world, [run])
+    windows = Check(world, [run], smoother, smoother.position_noise).windows
+    run.qpos[windows[1].first] = np.nan
+    files = Files.of(world, {world.candidate("dead_zone", "drive"): (0.2,)})
+    assert np.isfinite(files.predicted(world.model, windows)[1, 1:]).all()
