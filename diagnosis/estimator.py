@@ -1,11 +1,10 @@
 """The diagnosis in its four verbs: locate, name, model, show.
 
-    diagnosis = identify(world, train, held_out)     # simulator.World, lists of
-    recordings.Recording
+    diagnosis = identify(world, train, held_out)     # a World, lists of Recording
     diagnosis.summary["findings"]; diagnosis.corrected_xml
 
-Held-out recordings enter only after everything is chosen and fitted: they decide what is handed
-over.
+Recordings that were kept back decide what is handed over, after everything is chosen and fitted;
+held-out ones are only predicted.
 """
 
 from dataclasses import dataclass
@@ -31,12 +30,9 @@ STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 @dataclass
 class Outcome:
     """All that the report is made of: found (Found), fitted (Fitted set), trajectory (Trajectory
-    under it), others
-    {Candidate: [(other, values)]}, p_values, adequacy {Candidate: Dependence left}, strains
-    {Candidate: words}, left
-    ([Dependence] under the final set), dependences (under the nominal model), handed (Handed),
-    train_check and
-    held_check (Check)."""
+    under it), others {Candidate: [(other, values)]}, p_values, adequacy {Candidate: Dependence
+    left}, strains {Candidate: words}, left ([Dependence] under the final set), dependences (under
+    the nominal model), handed (Handed), train_check and held_check (Check)."""
 
     found: Found
     fitted: Fitted
@@ -58,9 +54,8 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     """Diagnose a simulator from recordings.
 
     world: simulator.World; train, held_out, kept_back: lists of Recording; the last decide what is
-    handed over (held_out by default). progress(done, message): called
-    with the share done,
-    0..1; log(message): with every decision. Raises RecordingError where the data say too little.
+    handed over (held_out by default). progress(done, message): called with the share done, 0..1;
+    log(message): with every decision. Raises RecordingError where the data say too little.
     """
     say, log = progress or (lambda done, message: None), log or (lambda message: None)
     if not any(np.isfinite(r.qpos).sum(0).max(initial=0) >= 10 for r in train):

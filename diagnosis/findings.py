@@ -195,7 +195,7 @@ def _figure(world, handed: Handed, check, settings):
     model = world.model
     out, channels = {}, {}
     for name, files in (("before", handed.nominal), ("after", handed.files)):
-        out[name], per_channel = check.rms(check.gaps(files))
+        out[name], per_channel = check.errors(files)
         for channel, value in per_channel.items():
             channels.setdefault(channel, {})[name] = value
     out["floor"], per_channel, check.scatter = prediction_error.floor_error(

@@ -55,8 +55,7 @@ class Files:
 @dataclass(frozen=True)
 class Handed:
     """setting: what was kept; files: its Files; nominal: those of the nominal model; without
-    {Candidate: error of the
-    files without it}."""
+    {Candidate: error of the files without it}."""
 
     setting: dict
     files: Files
@@ -79,24 +78,15 @@ class Check:
         """Smooth the recordings under a setting, for the floor."""
         self.trajectory = self.smoother.locate(setting, passes=2)
 
-    def gaps(self, files):
-        """Measured less predicted of Files, (W, T - 1, nv), and what was measured."""
-        qpos = files.predicted(self.world.model, self.windows)
-        return cut.gaps(self.world.model, self.windows, qpos)
-
-    def rms(self, gaps):
-        """(error over all channels in noises, {channel: SI})."""
-        gap, known = gaps
-        square, channels = gap**2, {}
-        for name, dofs in cut.channels(self.world.model).items():
-            if known[..., dofs].any():
-                channels[name] = float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
-        return float(np.sqrt((square / self.noise**2).sum() / max(known.sum(), 1))), channels
+    def errors(self, files):
+        """(error of Files over all channels in noises, {channel: SI})."""
+        model = self.world.model
+        return cut.error(model, self.windows, files.predicted(model, self.windows), self.noise)
 
     def error(self, files):
         """The contract's error of Files; infinite where they do not run."""
         try:
-            return self.rms(self.gaps(files))[0]
+            return self.errors(files)[0]
         except (ScriptError, ValueError, mujoco.FatalError):
             return np.inf
 

@@ -83,7 +83,7 @@ def turning(model, i):
     return False
 
 
-def _size(model, i):
+def size_of(model, i):
     """Length scale of a body: its radius of gyration, or its centre's distance from the joint."""
     return max(
         np.sqrt(model.body_inertia[i].max() / model.body_mass[i]),
@@ -102,7 +102,7 @@ class CenterOfMass(InertialEffect):
         return super().fits(model, i) and turning(model, i)
 
     def parameters(self, model, i):
-        s = _size(model, i)
+        s = size_of(model, i)
         return tuple(
             Parameter(n, "m", p, p - 10 * s, p + 10 * s, 0.02 * s)
             for n, p in zip("xyz", model.body_ipos[i])

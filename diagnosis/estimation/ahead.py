@@ -57,13 +57,6 @@ class Ahead:
         self.travel = self._travel()
         self.qpos, self.qvel = cut.recorded_starts(self.model, windows)
 
-    @property
-    def steps(self):
-        """Simulated steps of one prediction of all windows."""
-        return np.nansum(self.seconds.max(1, where=np.isfinite(self.seconds), initial=0.0)) / (
-            self.model.opt.timestep
-        )
-
     def _travel(self):
         start = self.measured[:, :1]
         gone = np.abs(

@@ -58,7 +58,7 @@ def without_step(fitted, index):
     evidence = kind(columns.ahead, columns.residual, stack, fitted.evidence.floor)
     every = np.arange(p + 2)
     wide, amounts = half_widths(evidence, every)
-    weight = evidence._weight(every, np.zeros(p + 1))
+    weight = evidence.weight(every, np.zeros(p + 1))
     whole = np.einsum("gc,gcij->ij", weight, evidence.gram)[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     even = whole / np.outer(scale, scale)
@@ -78,7 +78,7 @@ def half_widths(evidence, index):
     p = len(index) - 1
     if not p:
         return np.zeros(0), np.zeros(0)
-    weight = evidence._weight(index, np.zeros(p))
+    weight = evidence.weight(index, np.zeros(p))
     each = np.einsum("gc,gcij->gij", weight, evidence.gram[:, :, index][..., index])
     scale = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], 1e-300))
     gram, score = each[:, 1:, 1:] / np.outer(scale, scale), each[:, 1:, 0] / scale

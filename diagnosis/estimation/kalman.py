@@ -16,8 +16,7 @@ class Smoothed:
     updates:
 
     process, measurement: pairs (sum of squares, what that would be at the likelihood's optimum),
-    (n,) or (m,).
-    likelihood: log-likelihood summed over blocks.
+    (n,) or (m,). likelihood: log-likelihood summed over blocks.
     """
 
     state: np.ndarray
@@ -31,9 +30,8 @@ def smooth(A, c, Q, y, R, start, spread):
     """Smooth all blocks.
 
     A (T, b, n, n), c (T, b, n): from row t to t + 1; Q (T, b, n): variances of its noise. y (T, b,
-    m): the
-    first m components as measured, NaN where not; R (m,). start (b, n), spread (b, n): mean and
-    variances before the first row. The last row's A, c and Q are not used.
+    m): the first m components as measured, NaN where not; R (m,). start (b, n), spread (b, n): mean
+    and variances before the first row. The last row's A, c and Q are not used.
     """
     T, b, n = c.shape
     m = y.shape[-1]

@@ -34,9 +34,8 @@ def prediction_error(world, settings, recordings, noise):
 
 def floor_error(world, settings, smoother, trajectory, noise):
     """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}),
-    and how far the square of the
-    former scatters between recordings of the same motion, noise being what it is (a standard
-    deviation)."""
+    and how far the square of the former scatters between recordings of the same motion, noise being
+    what it is (a standard deviation)."""
     gap = floor_gaps(world, settings, smoother, trajectory)[:, 1:]
     known = np.isfinite(gap)
     square = np.where(known, gap**2, 0.0)
@@ -57,10 +56,8 @@ def floor_gaps(world, settings, smoother, trajectory, horizon=cut.HORIZON):
     where nothing was measured.
 
     The corrected model from smoothed states, from one row before each window on, stands for the
-    truth. It is measured
-    anew, with fresh noise, and predicted from starts as the error defines them: noisy, velocities
-    by differences; DRAWS
-    times, for noise alone makes this vary.
+    truth. It is measured anew, with fresh noise, and predicted from starts as the error defines
+    them: noisy, velocities by differences; DRAWS times, for noise alone makes this vary.
     """
     rng, model = np.random.default_rng(0), world.model
     windows = sparse(consecutive(smoother.recordings, horizon))
@@ -100,8 +97,7 @@ def curve(world, settings, smoother, trajectory, noise, longest=3 * cut.HORIZON,
     up to `longest`.
 
     Windows in which a prediction blew up before t are left out of its error there and counted, with
-    all that were measured
-    then: "blown_up": {"before":, "after":, "of":}, where there are any.
+    all that were measured then: "blown_up": {"before":, "after":, "of":}, where there are any.
     """
     windows = consecutive(smoother.recordings, longest)
     seconds = [w.recording.time[w.first : w.last + 1] - w.recording.time[w.first] for w in windows]

@@ -33,8 +33,7 @@ class Trajectory:
 
     qpos (rows, nq), qvel (rows, nv); force (rows, nv): what the simulator lacks, mean over the row
     that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free
-    (rows,):
-    where something touches, and no force is told; step: the simulator's, s, 0 if unknown.
+    (rows,): where something touches, and no force is told; step: the simulator's, s, 0 if unknown.
     """
 
     qpos: np.ndarray

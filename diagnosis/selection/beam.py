@@ -1,6 +1,6 @@
 """A beam over sets of effects on one matrix of sums: the sets worth a refit in the simulator.
 
-for setting in Beam(columns, evidence).sets(): ...
+start, nodes = Beam(columns, evidence).nodes()
 """
 
 from dataclasses import dataclass
@@ -36,16 +36,12 @@ class Beam:
         given = problem(self.columns, options)
         score = self.evidence.score(*given)
         setting = moved_setting(self.columns, score.amounts, options)
-        cost, penalty = (
-            0.0,
-            {o.candidate: o.prior for o in map(self.columns.options.__getitem__, options)},
-        )
-        for candidate, prior in penalty.items():
-            cost += prior.cost(setting[candidate])
+        chosen = [self.columns.options[k] for k in options]
+        cost = sum(o.prior.cost(setting[o.candidate]) for o in chosen)
         return Node(tuple(options), score, score.loss + cost / self.evidence.number)
 
     def nodes(self):
-        """All nodes met, best first; the first one met is the model as it is."""
+        """(node of the model as it is, all nodes met, best first)."""
         start = self.node(self.kept)
         met, beam = {start.options: start}, [start]
         for _ in range(DEPTH):

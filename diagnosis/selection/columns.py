@@ -1,7 +1,7 @@
 """Every effect as columns: how the open-loop predictions change with its values.
 
 columns = Columns(ahead, setting, usual)
-columns.options[3].candidate; columns.values(3, amounts)
+columns.options[3].candidate; columns.options[3].values(amounts)
 
 An option is a candidate begun at some values: one column for each parameter where it acts in
 proportion, one for a whole start of values where it does not (a dead zone, a delay of many rows).
@@ -19,10 +19,8 @@ TOGETHER = 40  # settings that are simulated in one call
 FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column stands for it
 PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
-STATES, PROMISING = (
-    300,
-    3,
-)  # of the motion, to compare forces at; groups of starts that are simulated
+STATES = 300  # of the motion, at which forces are compared
+PROMISING = 3  # groups of starts that are simulated
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
 
 
@@ -31,8 +29,7 @@ class Option:
     """A candidate at a start.
 
     base (k,): its values in the setting; directions (p, k): change of the values per unit of each
-    of
-    its p columns; columns (p,): their indices; low, high (p,): bounds of the amounts; prior: a
+    of its p columns; columns (p,): their indices; low, high (p,): bounds of the amounts; prior: a
     Prior.
     """
 
@@ -124,18 +121,10 @@ class Columns:
         else:
             out, whole = [], list(world.probes(candidate, recordings))
         together = candidate.effect.together
-        if together == 1:
-            whole = (
-                [
-                    whole[i]
-                    for i in np.unique(
-                        np.linspace(0, len(whole) - 1, min(len(whole), PROBES)).astype(int)
-                    )
-                ]
-                if whole
-                else []
-            )
-        if together > 1 and self.trajectory is not None:
+        if together == 1 and len(whole) > PROBES:
+            some = np.unique(np.linspace(0, len(whole) - 1, PROBES).astype(int))
+            whole = [whole[i] for i in some]
+        elif together > 1 and self.trajectory is not None:
             whole = self._promising(candidate, whole)
         for k in range(0, len(whole), together):
             rows = np.array(whole[k : k + together], float)

@@ -7,11 +7,9 @@ score.loss, score.groups, score.amounts
 gain = paired(score, other)
 
 A hypothesis predicts residual - columns @ amounts. Its error counts per cell: a channel (a joint, a
-free
-joint's position or rotation) in a band of time ahead, in a group of windows. The loss is the sum
-over
-channels of the mean over bands and groups of log RMS, each group predicted with the others'
-amounts.
+free joint's position or rotation) in a band of time ahead, in a group of windows. The loss is the
+sum over channels of the mean over bands and groups of log RMS, each group predicted with the
+others' amounts.
 """
 
 from dataclasses import dataclass
@@ -70,7 +68,6 @@ class Evidence:
         self.gram = np.zeros((groups, len(cells), K, K))
         self.count = np.zeros((groups, len(cells)))
         self.channels = len(ahead.channels)
-        self.cells = np.zeros(len(cells), bool)
         least = np.zeros(len(cells))
         for j, (dofs, b) in enumerate(cells):
             inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
@@ -122,11 +119,11 @@ class Evidence:
             return Score(float(groups.mean()), groups, amounts)
         g = self.gram[:, :, index][..., index]
         for _ in range(ITERATIONS):
-            weight = self._weight(index, amounts)
+            weight = self.weight(index, amounts)
             each = np.einsum("gc,gcij->gij", weight, g)
             whole = each.sum(0)
             amounts = bounded(whole[1:, 1:] + np.diag(precision), whole[1:, 0] + pull, low, high)
-        weight = self._weight(index, amounts)
+        weight = self.weight(index, amounts)
         each = np.einsum("gc,gcij->gij", weight, g)
         rest = each.sum(0) - each
         left = np.array(
@@ -135,7 +132,7 @@ class Evidence:
         groups = self.losses(self._square(index, left))
         return Score(float(groups.mean()), groups, amounts)
 
-    def _weight(self, index, amounts):
+    def weight(self, index, amounts):
         """(G, cells): weights of squares at which least squares lowers the sum of logs."""
         square = self._square(index, amounts)
         return np.where(
@@ -146,7 +143,7 @@ class Evidence:
         """In-sample gain (K,) in nats of each further column beside some at their amounts: a first
         look."""
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
-        weight = self._weight(index, np.asarray(amounts, float))
+        weight = self.weight(index, np.asarray(amounts, float))
         whole = np.einsum("gc,gcij->ij", weight, self.gram, optimize=True)
         inside = whole[np.ix_(index[1:], index[1:])] + np.diag(precision)
         score = whole[1:, 0] - whole[1:, index[1:]] @ amounts

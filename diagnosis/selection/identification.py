@@ -1,7 +1,7 @@
 """Rounds of locating, naming and judging, until no further effect earns its place.
 
 found = Identification(world, train).run()
-found.fitted.setting; found.trajectory; found.rivals
+found.fitted.setting; found.trajectory
 """
 
 from dataclasses import dataclass
@@ -17,24 +17,20 @@ from diagnosis.selection.plausibility import Usual
 ROUNDS = 4
 EARNS = 0.1  # nats of log RMS error, summed over channels, that an effect has to remove
 LEVEL = 0.05  # of false additions in all that is looked at
-IDLE = (
-    1.0  # nats that an effect must promise beside those chosen, to be looked at in further rounds
-)
+IDLE = 1.0  # nats that an effect must promise beside those chosen, to be looked at once more
 FINALISTS = 4  # sets that the simulator judges in a round
 
 
 @dataclass(frozen=True)
 class Found:
-    """What the search ended with: fitted, the Fitted set; bare, the same of the nominal model on
-    the same windows
-    and start states; trajectory and first, smoothed under it and under the nominal model."""
+    """What the search ended with: fitted, the Fitted set; trajectory and first, smoothed under it
+    and under the nominal model; judge, on the windows begun at that trajectory; ranking:
+    [(candidate, loss removed alone, p-value)], most first."""
 
     fitted: Fitted
-    bare: Fitted
     trajectory: object
     first: object
     smoother: Smoother
-    ahead: Ahead
     usual: Usual
     judge: Judge
     ranking: list
@@ -72,13 +68,9 @@ class Identification:
             setting = fitted.setting
             trajectory = smoother.locate(setting, trajectory, passes=1)
         self.ahead.start(trajectory)
-        judge = Judge(self.ahead, self.usual)
-        judge.seen = self.seen
+        judge = Judge(self.ahead, self.usual, seen=self.seen)
         fitted = judge.fit(setting)
-        bare = judge.fit({})
-        return Found(
-            fitted, bare, trajectory, first, smoother, self.ahead, self.usual, judge, ranking
-        )
+        return Found(fitted, trajectory, first, smoother, self.usual, judge, ranking)
 
     def _round(self, setting):
         """(Fitted, whether it is better than what there was, first ranking)."""
@@ -94,8 +86,7 @@ class Identification:
         self.log(
             f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}"
         )
-        judge = Judge(self.ahead, self.usual)
-        judge.seen = self.seen
+        judge = Judge(self.ahead, self.usual, seen=self.seen)
         now = judge.fit(setting)
         judge.reference = now.evidence.floor
         judged = [now]
@@ -113,17 +104,12 @@ class Identification:
 
     def _set_aside(self, beam, columns, chosen):
         """Leave out of further rounds what would have added nothing beside the chosen effects."""
-        options = [
-            k
-            for c in chosen.setting
-            for k in [k for k, o in enumerate(columns.options) if o.candidate is c][-1:]
-        ]
-        node = beam.node(options)
-        gain = beam.gains(node)
-        for candidate in self.candidates:
-            own = [gain[k] for k, o in enumerate(columns.options) if o.candidate is candidate]
-            if candidate not in chosen.setting and max(own, default=0.0) < IDLE:
-                self.idle.add(candidate)
+        last = {o.candidate: k for k, o in enumerate(columns.options)}
+        node = beam.node([last[c] for c in chosen.setting if c in last])
+        most = dict.fromkeys(self.candidates, 0.0)
+        for option, gain in zip(columns.options, beam.gains(node)):
+            most[option.candidate] = max(most.get(option.candidate, 0.0), gain)
+        self.idle |= {c for c, gain in most.items() if c not in chosen.setting and gain < IDLE}
 
     def _finalists(self, beam, start, nodes):
         """Nodes for the simulator: the best, and the best of each first effect and each size."""
@@ -151,16 +137,13 @@ class Identification:
         best = min(judged, key=lambda f: f.loss)
         if best is now or not self.earned(now, best, number):
             return now
-        near = [
-            f
-            for f in judged
-            if f is not now
-            and (
-                f.loss < best.loss + EARNS
-                or paired(f.score, best.score).gain < paired(f.score, best.score).spread
-            )
-        ]
-        return min(near, key=lambda f: (complexity(f.setting), f.loss))
+
+        def near(fitted):
+            step = paired(fitted.score, best.score)
+            return fitted.loss < best.loss + EARNS or step.gain < step.spread
+
+        good = [f for f in judged if f is not now and near(f)]
+        return min(good, key=lambda f: (complexity(f.setting), f.loss))
 
     def earned(self, before, after, number=1):
         """Whether a set removes enough of the loss, and by more than groups scatter, for the number

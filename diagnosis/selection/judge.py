@@ -2,7 +2,7 @@
 
 judge = Judge(ahead, usual)
 fitted = judge.fit({friction: (0.1,)})
-fitted.values, fitted.score.loss
+fitted.setting, fitted.loss
 """
 
 from dataclasses import dataclass, field
@@ -21,8 +21,7 @@ HALVINGS = 3  # of a step that does not lower the loss
 @dataclass(frozen=True)
 class Fitted:
     """A set of effects refitted. setting: {Candidate: values}; score: of the groups left out,
-    priors included;
-    columns, evidence: at these values."""
+    priors included; columns, evidence: at these values."""
 
     setting: dict
     score: Score
@@ -44,29 +43,25 @@ class Judge:
     """Refits settings in the simulator on the windows of an Ahead; reference: floors of the cells
     to compare by."""
 
-    def __init__(self, ahead, usual, reference=None):
+    def __init__(self, ahead, usual, reference=None, seen=None):
+        """seen: {candidate: which of its parameters show}, shared with other looks."""
         self.ahead, self.usual, self.reference = ahead, usual, reference
-        self.simulated, self.seen = 0, {}
+        self.seen = {} if seen is None else seen
 
     def fit(self, setting, steps=STEPS):
         """The Fitted values of a set of effects, begun at the values given."""
         setting, residual = {c: self._inside(c, v) for c, v in setting.items()}, None
         for left in range(steps, -1, -1):
             columns = Columns(self.ahead, setting, self.usual, list(setting), residual, self.seen)
-            self.simulated += columns.simulated
             evidence = Evidence(self.ahead, columns.residual, columns.array, self.reference)
             index, low, high, precision, pull = problem(columns, range(len(columns.options)))
             score = evidence.score(index, low, high, precision, pull)
-            here = evidence.score((), *[np.zeros(0)] * 4)
             better = self._lower(columns, evidence, score.amounts, setting) if left else None
             if better is None:
                 break
             setting, residual = better
         prior = self.cost(setting) / evidence.number
-        # values of left-out groups deviate by no more than those fitted without them
         final = Score(score.loss + prior, score.groups + prior, score.amounts)
-        if not len(index):
-            final = Score(here.loss + prior, here.groups + prior, here.amounts)
         return Fitted(setting, final, columns, evidence)
 
     def _lower(self, columns, evidence, amounts, setting):
@@ -77,7 +72,6 @@ class Judge:
             moved = moved_setting(columns, share * amounts)
             if np.isfinite(self.cost(moved)):
                 residual = self.ahead.residual([moved])[0]
-                self.simulated += 1
                 if self._whole(residual, moved, evidence) < inside - DONE:
                     return moved, residual
             share /= 3

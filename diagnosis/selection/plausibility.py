@@ -6,21 +6,21 @@ prior = plausible(candidate, usual)                # centre, scale, low, high of
 
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from diagnosis.effects.actuators import ActuatorEffect
-from diagnosis.effects.bodies import _size
+from diagnosis.effects.base import joints_of
+from diagnosis.effects.bodies import size_of
 from diagnosis.estimation import windows as cut
 
 TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 
-# of each effect: (unit, scale, low, high) in that unit, one row for all its parameters or one for
-# each.
-#   times: ratio to the nominal value      force: share of the joint's usual force
-# inertia: share of what the joint moves  size: of the body        plain: in the parameter's own
-# unit
-#   used: share of the largest force asked for     gone: share of the recorded travel
+# of each effect: (unit, scale, low, high), one row for all its parameters, or one for each. Units:
+#   plain: the parameter's own                  times: the nominal value
+#   force: what is usual in the joint           inertia: what the joint moves
+#   per speed, per travel: so much force at the joint's usual speed, or travel
+#   travel: the joint's recorded range          size, weight: the body's
+#   used, strength: the largest force that the controls ask for
 TABLE = {
     "mass": [("times", 0.4, 0.05, 30.0)],
     "payload_change": [("times", 0.4, 0.3, 3.0)],
@@ -131,9 +131,8 @@ class Usual:
     def dof(self, place):
         """The dof of a joint's place, or of the joint an actuator acts on; None elsewhere."""
         if place.kind == "joint":
-            first = place.name.split("+")[0]  # of two that an effect couples
-            known = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, place.name) >= 0
-            return self.model.jnt_dofadr[self.model.joint(place.name if known else first).id]
+            first, *_ = joints_of(self.model, place.name)  # of two that an effect couples
+            return self.model.jnt_dofadr[first]
         if place.kind == "actuator":
             i = self.model.actuator(place.name).id
             if ActuatorEffect.on_joint(self.model, i):
@@ -146,7 +145,7 @@ class Usual:
         if kind == "plain":
             return 1.0
         if kind == "size":
-            return _size(model, model.body(place.name).id)
+            return size_of(model, model.body(place.name).id)
         if kind == "weight":
             return 10.0 * model.body_subtreemass[model.body(place.name).id]
         if kind in ("used", "strength"):

@@ -1,7 +1,7 @@
 """What could stand in a finding's place: effects whose refits predict as well, told as a class, the
 simplest first.
 
-fitted, others = classes(identification, found)      # others: {candidate: [(other, values), ...]}
+fitted, others = classes(candidates, judge, fitted)  # others: {candidate: [(other, values), ...]}
 """
 
 import numpy as np
@@ -14,9 +14,8 @@ from diagnosis.selection.identification import EARNS, complexity
 # other
 ALIKE = 0.7
 SAME = 0.03  # loss by which the simplest member of a class may be worse than the one found
-FURTHER = (
-    2.5  # how much more complex another member of a class may be: three components for one number
-)
+# how much more complex another member of a class may be: three components for one number
+FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
@@ -67,10 +66,7 @@ def _alike(judge, fitted, candidate, pool):
     """
     ahead = judge.ahead
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    columns = Columns(
-        ahead, rest, judge.usual, _near(judge.ahead.world, candidate, pool) + list(rest)
-    )
-    judge.simulated += columns.simulated
+    columns = Columns(ahead, rest, judge.usual, _near(ahead.world, candidate, pool) + list(rest))
     gone = columns.residual - fitted.columns.residual
     evidence = Evidence(ahead, gone, columns.array, fitted.evidence.floor)
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]
@@ -111,7 +107,7 @@ def _near(world, candidate, pool):
 def _left(evidence, columns):
     """Weighted squares that columns leave of what is gone."""
     index = np.concatenate([[0], np.asarray(columns, int) + 1]).astype(int)
-    weight = evidence._weight(np.array([0]), np.zeros(0))
+    weight = evidence.weight(np.array([0]), np.zeros(0))
     whole = np.einsum("gc,gcij->ij", weight, evidence.gram[:, :, index][..., index])
     if len(index) == 1:
         return whole[0, 0]

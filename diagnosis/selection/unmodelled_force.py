@@ -23,8 +23,7 @@ CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 @dataclass(frozen=True)
 class Dependence:
     """share: of the located force's variance at the joint that the curve predicts; size: RMS of the
-    curve's force;
-    candidate, values: the curve and the forces at its knots."""
+    curve's force; candidate, values: the curve and the forces at its knots."""
 
     joint: str
     variables: tuple

@@ -14,7 +14,6 @@ from diagnosis.simulation.batch import threads
 from diagnosis.simulation.control_signal import SLACK
 from diagnosis.simulation.simulator import Case
 
-FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 INPUT = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 CHUNK = 40000  # simulations in memory at a time
 SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per second, of the force
@@ -24,8 +23,7 @@ class RowMap:
     """Simulates every row of some recordings under a setting, with a constant extra force in each.
 
     Effects that add coordinates of their own (backlash) or act under a condition are left out: a
-    row
-    knows the nominal model's coordinates alone.
+    row knows the nominal model's coordinates alone.
 
     begin: the rows (n,) that have a next one, counted through all recordings; seconds (n,).
     """

@@ -90,7 +90,7 @@ def test_a_first_look_is_the_gain_of_least_squares():
     evidence = evidence_of(ahead, residual, columns)
     start = free(evidence, (1,))
     gains = evidence.looks((1,), start.amounts, np.zeros(1))
-    weight = evidence._weight(np.array([0, 2]), start.amounts)
+    weight = evidence.weight(np.array([0, 2]), start.amounts)
     rows = np.sqrt(weight[ahead.group])[:, None, :] * np.ones(ahead.known.shape)
     y, x = (rows * residual).ravel(), (rows[..., None] * columns).reshape(-1, 4)
     left = lambda keep: np.sum(
