@@ -3,10 +3,10 @@
     sim = BatchEnv("Hopper-v4", num_envs=32)
     real = BatchEnv("Hopper-v4", num_envs=32, perturbation=parse_perturbation("torso:mass*1.27"))
     obs, _ = sim.reset(seed=0)
-    obs, reward, terminated, truncated, info = sim.step(actions)   # info["next_obs"]: before any reset
+    obs, reward, terminated, truncated, info = sim.step(actions)  # info["next_obs"]: before resets
 
-Every environment of a batch is one row of a `mujoco.batch.Batch`, so a step is one call on all cores.
-Observations, rewards, ends and resets equal `gymnasium.make(id)`, seed for seed.
+Every environment of a batch is one row of a `mujoco.batch.Batch`, so a step is one call on all
+cores. Observations, rewards, ends and resets equal `gymnasium.make(id)`, seed for seed.
 """
 
 import copy
@@ -27,7 +27,7 @@ class EnvError(ValueError):
     """A request about an environment that cannot be met; the message says what to do instead."""
 
 
-# --- the three tasks of the paper -------------------------------------------------------------------
+# --- the three tasks of the paper -----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def model_path(env_id):
     return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / task_of(env_id).xml
 
 
-# --- the "real" world: the sim with named changes ---------------------------------------------------
+# --- the "real" world: the sim with named changes -------------------------------------------------
 
 JOINT_FIELDS = {
     "damping": "dof_damping",
@@ -163,7 +163,7 @@ FIELDS = ("mass", *JOINT_FIELDS, "gain", "gravity")
 
 @dataclass(frozen=True)
 class Change:
-    """One edit of a model: the field of the named body, joint or actuator is set to, or scaled by, value."""
+    """One edit of a model: a field of a body, joint or actuator is set to, or scaled by, value."""
 
     name: str
     field: str
@@ -175,16 +175,18 @@ class Change:
         new = self.value if self.op == "=" else float(old) * self.value
         if not np.isfinite(new):
             raise EnvError(
-                f"{self.name}:{self.field}*{self.value:g} makes {new} of {old:g}: choose a smaller factor"
+                f"{self.name}:{self.field}*{self.value:g} makes {new} of {old:g}: "
+                "choose a smaller factor"
             )
         return new
 
 
 def parse_perturbation(text):
-    """ "torso:mass*1.27,foot_joint:frictionloss=0.5" -> list of Change. Raises EnvError if it does not parse.
+    """ "torso:mass*1.27,foot_joint:frictionloss=0.5" -> list of Change.
 
-    Fields: mass (of a body), damping, frictionloss, armature (of a joint), gain (of an actuator, or of the
-    actuator on a named joint), gravity ("world:gravity*0.9": the downward acceleration). "" is no change.
+    Fields: mass (of a body), damping, frictionloss, armature (of a joint), gain (of an actuator, or
+    of the actuator on a named joint), gravity ("world:gravity*0.9": the downward acceleration). ""
+    is no change. Raises EnvError if it does not parse.
     """
     changes = []
     for part in filter(None, (part.strip() for part in text.split(","))):
@@ -205,7 +207,8 @@ def parse_perturbation(text):
             or (field in JOINT_FIELDS and value < 0)
         ):
             raise EnvError(
-                f"{part!r}: {value:g} is no possible {field}: give a finite{' positive' * (field == 'mass')} number"
+                f"{part!r}: {value:g} is no possible {field}: "
+                f"give a finite{' positive' * (field == 'mass')} number"
             )
         changes.append(Change(name.strip(), field, op, value))
     return changes
@@ -221,11 +224,13 @@ def _id_of(model, kind, change):
 
 
 def perturb(model, changes):
-    """A copy of a compiled mujoco.MjModel with Changes applied. Raises EnvError for a name that it lacks.
+    """A copy of a compiled mujoco.MjModel with Changes applied.
 
-    Inertia scales along with mass, and mj_setConst renews what MuJoCo derives from both. Editing the compiled
-    model rather than its XML matters for HalfCheetah, whose compiler rescales every edit to a total of 14 kg.
-    A servo's gain stands in its bias too: both scale, and it still goes where it is told.
+    Inertia scales along with mass, and mj_setConst renews what MuJoCo derives from both. Editing
+    the compiled model rather than its XML matters for HalfCheetah, whose compiler rescales every
+    edit to a total of 14 kg. A servo's gain stands in its bias too: both scale, and it still goes
+    where it is told.
+    Raises EnvError for a name that the model lacks.
     """
     model = copy.copy(model)
     for change in changes:
@@ -250,7 +255,8 @@ def perturb(model, changes):
             ]
             if not actuators:
                 raise EnvError(
-                    f"no actuator {change.name!r} for its gain: name its joint, one of {', '.join(joints)}"
+                    f"no actuator {change.name!r} for its gain: "
+                    f"name its joint, one of {', '.join(joints)}"
                 )
             for i in actuators:
                 old = model.actuator_gainprm[i, 0]
@@ -265,23 +271,27 @@ def perturb(model, changes):
     return model
 
 
-# --- the environment --------------------------------------------------------------------------------
+# --- the environment ------------------------------------------------------------------------------
 
 
 class BatchEnv(VectorEnv):
     """num_envs copies of a gymnasium task, stepped together; see the module's docstring.
 
-    An ended episode starts anew within the same step (AutoresetMode.SAME_STEP): the returned observation is
-    the new episode's first, and info["next_obs"] (num_envs, nobs) holds every transition's true successor.
+    An ended episode starts anew within the same step (AutoresetMode.SAME_STEP): the returned
+    observation is the new episode's first, and info["next_obs"] (num_envs, nobs) holds every
+    transition's true successor.
 
     Args:
       env_id: one of ENV_IDS. num_envs: copies. perturbation: Changes that make this world "real".
-      model: a mujoco.MjModel to run instead of gymnasium's own: the same joints, and its actuators first.
+      model: a mujoco.MjModel to run instead of gymnasium's own: the same
+      joints, and its actuators first.
       nthread: threads of the simulator's pool, 0 for all cores.
-    Where a step is unstable (NaN or huge values), as a robot thrown about by a bad policy can make it, that robot's
-    episode terminates where it last was, unpaid.
-    counterfactual_steps: how many steps were simulated from here without being taken (peek, predict).
-    Raises EnvError: unknown id or name, num_envs < 1, or (in step) every simulation unstable at once.
+    Where a step is unstable (NaN or huge values), as a robot thrown about by a bad policy can make
+    it, that robot's episode terminates where it last was, unpaid.
+    counterfactual_steps: how many steps were simulated from here without
+    being taken (peek, predict).
+    Raises EnvError: unknown id or name, num_envs < 1, or (in step) every
+    simulation unstable at once.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -295,7 +305,10 @@ class BatchEnv(VectorEnv):
         nominal = mujoco.MjModel.from_xml_path(str(model_path(env_id)))
         self.model = nominal if model is None else model
         if self.model.nq != nominal.nq or self.model.nu < nominal.nu:
-            sizes = f"{self.model.nq} coordinates and {self.model.nu} actuators, {env_id} has {nominal.nq} and {nominal.nu}"
+            sizes = (
+                f"{self.model.nq} coordinates and {self.model.nu} actuators, "
+                f"{env_id} has {nominal.nq} and {nominal.nu}"
+            )
             raise EnvError(f"the given model has {sizes}: give one with the same joints")
         if perturbation:
             self.model = perturb(self.model, perturbation)
@@ -349,8 +362,8 @@ class BatchEnv(VectorEnv):
           applied: (num_envs, nu), what drives the joints, if an action transformer changed it.
 
         Returns:
-          obs (num_envs, nobs), reward (num_envs,), terminated, truncated (num_envs,) bool, info with "next_obs"
-          and, where episodes ended, gymnasium's "final_obs" and "_final_obs".
+          obs (num_envs, nobs), reward (num_envs,), terminated, truncated (num_envs,) bool, info
+          with "next_obs" and, where episodes ended, gymnasium's "final_obs" and "_final_obs".
         """
         actions = np.asarray(actions)
         if actions.shape != self.action_space.shape:
@@ -383,10 +396,11 @@ class BatchEnv(VectorEnv):
         return self.obs.copy(), reward, terminated, truncated, info
 
     def predict(self, obs, applied):
-        """One step from the states behind obs (num_envs, nobs) under applied: the next observations.
+        """The next observations, one step under applied from the states
+        behind obs (num_envs, nobs).
 
-        What an observation leaves out is set to 0 (root x) or taken as it stands (a clipped velocity). The
-        environment must be reset afterwards.
+        What an observation leaves out is set to 0 (root x) or taken as it stands (a clipped
+        velocity). The environment must be reset afterwards.
         """
         qpos, qvel = self.task.state(obs, self.model)
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE.value)
@@ -400,7 +414,7 @@ class BatchEnv(VectorEnv):
         return np.where(self._unstable(self.batch)[:, None], self.obs, self.observe())
 
     def peek(self, actions):
-        """Where one step under actions would lead from the present states: the next observations; nothing moves."""
+        """The next observations, were actions taken from the present states; nothing moves."""
         if self._peek is None:
             self._peek = Batch(self.model, self.num_envs, self.batch.nthread)
         self._peek.state[:] = self.batch.state
@@ -411,7 +425,9 @@ class BatchEnv(VectorEnv):
         return np.where(self._unstable(self._peek)[:, None], self.observe(), after)
 
     def _unstable(self, batch):
-        """Which rows of a batch became unstable in its last steps: (N,) bool. Raises EnvError where all did."""
+        """Which rows of a batch became unstable in its last steps: (N,) bool.
+
+        Raises EnvError where all did."""
         if not batch.warning.any():
             return np.zeros(self.num_envs, bool)
         # columns: last offending index, how often; a NaN control counts as unstable too

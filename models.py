@@ -1,9 +1,9 @@
-"""The four networks of the method: policies and values for TRPO, forward and inverse models for grounding.
+"""The networks of the method: policy and value for TRPO, forward and inverse models to ground.
 
     policy = GaussianPolicy(nobs=11, nact=3)
-    action = policy.act(obs)                           # (N, 3), sampled; .mean(obs) is deterministic
+    action = policy.act(obs)                       # (N, 3), sampled; .mean(obs) is deterministic
     torch.save(policy.checkpoint(), "policy.pt"); policy = GaussianPolicy.load("policy.pt")
-    f = ForwardModel(11, 3); f.fit(s, a, s_next, guess, generator); s_hat = f(s, a, guess)      # f_psi
+    f_psi = ForwardModel(11, 3); f_psi.fit(s, a, s_next, guess, generator); f_psi(s, a, guess)
 
 All are float32 MLPs that normalise their own inputs, and need torch alone.
 """
@@ -21,8 +21,9 @@ LOG_2PI_E = math.log(2 * math.pi * math.e)
 
 @contextmanager
 def torch_threads(n):
-    """Meanwhile torch takes n threads. All numbers here are made with one: sums that several threads share round
-    otherwise, and in a rollout torch's threads would fight the simulator's pool for the cores."""
+    """Meanwhile torch takes n threads. All numbers here are made with one: sums that several
+    threads share round otherwise, and in a rollout torch's threads would fight the simulator's pool
+    for the cores."""
     before = torch.get_num_threads()
     torch.set_num_threads(n)
     try:
@@ -34,8 +35,9 @@ def torch_threads(n):
 def as_vector(network):
     """The parameters of a network as the one vector that they become views of: (n,).
 
-    A network that was trained, one that was loaded and a copy of either lie in memory in the same way from here on:
-    products round by where their factors lie, and a run that goes on would drift from the run it was.
+    A network that was trained, one that was loaded and a copy of either lie in memory in the same
+    way from here on: products round by where their factors lie, and a run that goes on would drift
+    from the run it was.
     """
     vector = parameters_to_vector(network.parameters()).detach()
     vector_to_parameters(vector, network.parameters())
@@ -43,10 +45,11 @@ def as_vector(network):
 
 
 class MLP(nn.Sequential):
-    """Fully connected tanh layers and a linear last one; orthogonal weights, the last layer's scaled by last_gain.
+    """Fully connected tanh layers, the last one linear; orthogonal
+    weights, the last times last_gain.
 
-    The derivatives that learning asks for most are written out. Autograd finds the same numbers, bit for bit, but in
-    networks this small its bookkeeping takes as long as the arithmetic.
+    The derivatives that learning asks for most are written out. Autograd finds the same numbers,
+    bit for bit, but in networks this small its bookkeeping takes as long as the arithmetic.
     """
 
     @torch_threads(1)
@@ -64,7 +67,7 @@ class MLP(nn.Sequential):
 
     @torch.no_grad()
     def values(self, x):
-        """What enters each linear layer, and the network's output: [x, h_1, ..., y], all (N, width)."""
+        """What enters each linear layer, and the output: [x, h_1, ..., y], all (N, width)."""
         values = [x]
         for layer in self.linear:
             values.append(torch.addmm(layer.bias, values[-1], layer.weight.t()))
@@ -74,7 +77,9 @@ class MLP(nn.Sequential):
 
     @torch.no_grad()
     def gradient(self, values, g):
-        """J' g, J the Jacobian of the output by the weights: a list in the order of parameters(). g: (N, outputs)."""
+        """J' g for g (N, outputs), J the Jacobian of the output by the weights.
+
+        Returns a list in the order of parameters()."""
         found = []
         for k, layer in reversed(list(enumerate(self.linear))):
             found = [g.t() @ values[k], g.sum(0), *found]
@@ -86,7 +91,7 @@ class MLP(nn.Sequential):
 
     @torch.no_grad()
     def tangent(self, values, v):
-        """J v, (N, outputs), for v a list of changes of the weights in the order of parameters()."""
+        """J v, (N, outputs), for v a list of changes of the weights, as parameters() has them."""
         moved = None
         for layer, x, weight, bias in zip(self.linear, values, v[::2], v[1::2]):
             through = torch.addmm(bias, x, weight.t())
@@ -97,12 +102,12 @@ class MLP(nn.Sequential):
 
 
 def adam(net, lr):
-    """Adam on all weights of a network as one vector: the same numbers, bit for bit, in fewer calls."""
+    """Adam on all weights of a network as one vector: the same numbers in fewer calls."""
     return torch.optim.Adam([nn.Parameter(as_vector(net))], lr=lr)
 
 
 def tie(optimizer, net):
-    """Make adam()'s vector the weights of net again: a copy or a conversion of either has parted them."""
+    """Make adam()'s vector the weights of net again, where a copy of either has parted them."""
     [weights] = optimizer.param_groups[0]["params"]
     weights.data = as_vector(net)
     moments = optimizer.state[weights]
@@ -118,7 +123,7 @@ def least_squares_step(net, optimizer, x, y):
 
 
 class Normalizer(nn.Module):
-    """(x - mean) / std with statistics kept as buffers: saved with the network, never trained by gradients."""
+    """(x - mean) / std, the statistics kept as buffers: saved, but not trained by gradients."""
 
     def __init__(self, size, clip=10.0):
         super().__init__()
@@ -154,9 +159,10 @@ class Normalizer(nn.Module):
 
 
 class GaussianPolicy(nn.Module):
-    """pi(a|s) = N(mean_theta(s), diag(exp(log_std))^2): an MLP mean and a state-independent log_std.
+    """pi(a|s) = N(mean_theta(s), diag(exp(log_std))^2): the mean an MLP, log_std the same anywhere.
 
-    Args: nobs, nact: widths. hidden: hidden layer widths. log_std: initial value for every action dimension.
+    Args: nobs, nact: widths. hidden: hidden layer widths. log_std: initial
+    value for every action dimension.
     low, high: the robot's bounds of an action, (nact,), which action() keeps; what is learnt from
     is unbounded.
     """
@@ -190,7 +196,8 @@ class GaussianPolicy(nn.Module):
 
     @torch.no_grad()
     def sampler(self, generator=None):
-        """act() of the policy as it now is: in a rollout, what depends on its weights alone is worked out once."""
+        """act() of the policy as it now is, with what depends on its
+        weights alone worked out once."""
         center, std, clip, sigma = (
             self.normalizer.mean,
             self.normalizer.std,
@@ -215,7 +222,9 @@ class GaussianPolicy(nn.Module):
 
     @classmethod
     def load(cls, path):
-        """The policy whose checkpoint() is in a file. Raises ValueError for any other file; never unpickles code."""
+        """The policy whose checkpoint() is in a file, of which no code is run.
+
+        Raises ValueError for any other file."""
         saved = load_checkpoint(path)
         try:
             sizes = saved["sizes"]
@@ -229,7 +238,9 @@ class GaussianPolicy(nn.Module):
 
 
 def load_checkpoint(path):
-    """torch.load with weights_only=True. Raises ValueError, in one line, for whatever it cannot read."""
+    """torch.load with weights_only=True.
+
+    Raises ValueError, in one line, for what it cannot read."""
     try:
         return torch.load(path, weights_only=True)
     except FileNotFoundError:
@@ -272,7 +283,7 @@ class Value(nn.Module):
         return self.returns.inverse(self.net(self.normalizer(obs)))[:, 0]
 
 
-# --- supervised models of the dynamics --------------------------------------------------------------
+# --- supervised models of the dynamics ------------------------------------------------------------
 
 
 class Regressor(nn.Module):
@@ -288,11 +299,14 @@ class Regressor(nn.Module):
 
     @torch_threads(1)
     def fit(self, x, y, generator, max_updates=5_000, patience=10, batch_size=256, lr=1e-3):
-        """Least squares with Adam, for at most max_updates * batch_size samples; stops earlier when the held-out fifth
-        has not improved for `patience` epochs.
+        """Least squares with Adam, for at most max_updates * batch_size samples.
 
-        Args: x (N, n_in), y (N, n_out) float32 tensors; generator: the split and the batches are drawn from it.
-        Returns: the RMS error of each output on the held-out rows, (n_out,), which chose the best epoch, whose weights stay.
+        It stops earlier when the held-out fifth has not improved for `patience` epochs.
+
+        Args: x (N, n_in), y (N, n_out) float32 tensors; generator: the split
+        and the batches are drawn from it.
+        Returns: the RMS error of each output on the held-out rows, (n_out,),
+        which chose the epoch whose weights stay.
         """
         order = torch.randperm(len(x), generator=generator)
         held, train = order[: max(1, len(x) // 5)], order[max(1, len(x) // 5) :]
@@ -324,11 +338,11 @@ class Regressor(nn.Module):
 
 
 class ForwardModel(Regressor):
-    """f_psi(s, a) -> s', on top of a first guess of s': the state itself, or where the raw sim goes from s under a.
+    """f_psi(s, a) -> s', on top of a first guess: the state itself, or where the raw sim goes.
 
-    With the sim as guess the network learns only what the sim gets wrong. That matters where contacts make s'
-    jump: a network fitted on a few thousand Hopper transitions errs several times more than the raw sim does,
-    and its errors would be all that R_AT shows the action transformer.
+    With the sim as guess the network learns only what the sim gets wrong. That matters where
+    contacts make s' jump: a network fitted on a few thousand Hopper transitions errs several times
+    more than the raw sim does, and its errors would be all that R_AT shows the action transformer.
     """
 
     def __init__(self, nobs, nact, hidden=(128, 128)):
@@ -339,7 +353,9 @@ class ForwardModel(Regressor):
         return guess + super().forward(torch.cat((s, a, guess - s), -1))
 
     def fit(self, s, a, s_next, guess, generator, **settings):
-        """Fit to transitions and guesses, all (N, ...). Returns the held-out RMS error of each dimension of s'."""
+        """Fit to transitions and guesses, all (N, ...).
+
+        Returns the held-out RMS error by dimension."""
         return super().fit(torch.cat((s, a, guess - s), -1), s_next - guess, generator, **settings)
 
 
@@ -353,5 +369,5 @@ class InverseModel(Regressor):
         return super().forward(torch.cat((s, s_next - s), -1))
 
     def fit(self, s, s_next, a, generator, **settings):
-        """Fit to transitions (N, nobs), (N, nobs), (N, nact). Returns the held-out RMS error of each action."""
+        """Fit to (N, nobs), (N, nobs), (N, nact). Returns the held-out RMS error of each action."""
         return super().fit(torch.cat((s, s_next - s), -1), a, generator, **settings)

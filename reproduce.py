@@ -6,8 +6,9 @@
     python reproduce.py --claims                          # figures and results/claims.csv from the rows that are there
     python reproduce.py --merge other/results             # rows that another machine made
 
-Runs are train.py's and lie in runs/VERSION/. results/rounds.csv has a row per grounding step, results/judged.csv one
-per run, with the code's version and the commit. What is there already is not run again; a run that was cut off goes on.
+Runs are train.py's and lie in runs/VERSION/. results/rounds.csv has a row per grounding step,
+results/judged.csv one per run, with the code's version and the commit. What is there already is not
+run again; a run that was cut off goes on.
 """
 
 import argparse
@@ -113,7 +114,8 @@ def run_all(jobs, width, deadline, keep):
 
 
 def commit():
-    """The commit that the code is of, with + where files differ from it; "" outside a repository."""
+    """The commit that the code is of, with + where files differ from
+    it; "" outside a repository."""
     git = lambda *words: subprocess.run(
         ["git", "-C", str(ROOT), *words], capture_output=True, text=True
     )
@@ -155,7 +157,9 @@ def parse(argv):
 
 
 def main(argv=None):
-    """The command; returns its exit status. 0: done; 1: runs failed or wait; 2: a request that cannot be met."""
+    """The command; returns its exit status.
+
+    0: done; 1: runs failed or wait; 2: a request that cannot be met."""
     args = parse(argv)
     tables = args.results / "rounds.csv", args.results / "judged.csv"
     try:

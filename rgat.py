@@ -2,12 +2,12 @@
 
     sim = BatchEnv("Hopper-v4", 32)
     grounding = RGAT(sim, settings)
-    grounding.fit(tau_real, seed)                      # f_psi                        Algorithm 1, line 3
-    grounding.update(policy, at_steps, seed)           # g_phi                        Algorithm 1, line 4
-    grounded = GroundedEnv(sim, grounding.transformer)     # what the policy trains in    Algorithm 1, line 5
+    grounding.fit(tau_real, seed)                          # f_psi: Algorithm 1, line 3
+    grounding.update(policy, at_steps, seed)               # g_phi: Algorithm 1, line 4
+    grounded = GroundedEnv(sim, grounding.transformer)     # what the policy trains in: line 5
 
-An action transformer is any function (s, a) -> a_hat on arrays (N, nobs), (N, nact). Every method of the paper
-is one class with the same two steps.
+An action transformer is any function (s, a) -> a_hat on arrays (N, nobs), (N, nact). Every method
+of the paper is one class with the same two steps.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from models import (
 )
 from trpo import TRPO, TRPOConfig, rollouts
 
-# the action transformer's own trust region, entropy and discount; section IV-D has 1e-4, 1e-5 and 0.99 (see README)
+# g_phi's own trust region, entropy and discount; section IV-D has 1e-4, 1e-5 and 0.99
 AT_CONFIG = TRPOConfig(batch_size=1024, max_kl=1e-2, entropy=1e-5, gamma=0.0)
 
 
@@ -42,7 +42,7 @@ def identity(obs, action):
 
 
 class GroundedEnv(VectorWrapper):
-    """The grounded simulator (paper, Fig. 1 and 2a): the transformer acts before the sim, the reward sees a, not a_hat."""
+    """The grounded simulator (paper, Fig. 1 and 2a): the sim does a_hat, the reward sees a."""
 
     def __init__(self, env, transformer=identity):
         super().__init__(env)
@@ -62,7 +62,7 @@ class GroundedEnv(VectorWrapper):
 class RealModel:
     """f_psi as both methods use it: the network, and the guess of s' that it starts from.
 
-    residual: guess where the sim goes; else that the state stays, which is the paper's f_psi of s and a alone.
+    residual: guess where the sim goes; else that the state stays: the paper's f_psi(s, a).
     """
 
     def __init__(self, sim, residual):
@@ -72,7 +72,9 @@ class RealModel:
         )
 
     def fit(self, tau_real, seed):
-        """Fit to real Transitions, the sim started in each of their states. Returns the held-out RMS error by dimension."""
+        """Fit to real Transitions, the sim started in each of their states.
+
+        Returns the held-out RMS error by dimension."""
         torch.manual_seed(seed)
         self.net = ForwardModel(
             *(
@@ -83,7 +85,8 @@ class RealModel:
         seen = tau_real if not self.residual else tau_real[measured(self.sim, tau_real.s)]
         if len(seen) < 2:
             raise EnvError(
-                f"{len(seen)} usable real transitions are too few to fit a model on: raise --real-trajectories"
+                f"{len(seen)} usable real transitions are too few to fit a model on: "
+                "raise --real-trajectories"
             )
         guess = predict_all(self.sim, seen) if self.residual else seen.s
         s, a, s_next = seen.tensors()
@@ -93,11 +96,11 @@ class RealModel:
 
     @torch.no_grad()
     def __call__(self, s, a):
-        """f_psi(s, a) and the guess of it, both (N, nobs) float32, s being the sim's present observations."""
+        """f_psi(s, a) and the guess of it, both (N, nobs) float32, s what the sim now observes."""
         s, a = np.asarray(s, np.float32), np.asarray(a, np.float32)
         guess = self.sim.peek(a).astype(np.float32) if self.residual else s
         predicted = self.net(*(torch.from_numpy(x) for x in (s, a, guess))).numpy()
-        # a state that the observation does not show in full was never fitted: there the sim's word stands
+        # the sim's word stands for states that the observation hides in part: none was fitted
         return (
             np.where(measured(self.sim, s)[:, None], predicted, guess)
             if self.residual
@@ -121,9 +124,9 @@ def predict_all(sim, transitions):
 
 
 class ActionTransformer:
-    """g_phi as it is used for policy improvement: a_hat = a + delta_a, delta_a the mean of a Gaussian policy.
+    """g_phi as the policy meets it: a_hat = a + delta_a, delta_a the mean of a Gaussian policy.
 
-    The policy's output is in units of the action range, so that 1 reaches from one bound to the other.
+    Its output is in units of the action range, so that 1 reaches from one bound to the other.
     """
 
     def __init__(self, policy, low, high):
@@ -143,13 +146,19 @@ class ActionTransformerEnv(VectorEnv):
     """The grounding step as a reinforcement learning problem (paper, section III and Fig. 2b).
 
     The agent is g_phi: it observes (s, a), a ~ pi_theta(s), chooses delta_a, and is paid
-    R_AT = -||f_psi(s, a) - s'||^2, each dimension in units of `scale`: how much it changes in a real step. In raw
-    units the fast joints are all that counts, and what makes a robot fall, its slow root, is given up for them.
-    The target policy and the sim are g_phi's environment. R_AT is never positive,
-    so an agent that could end episodes would learn to: the task's falls are handed out as truncations, which
-    TRPO bootstraps like time limits. With baseline, the reward is counted from what a itself would have got in the
-    sim, -||f_psi(s, a) - guess||^2: for gamma 0 g_phi does not influence that. With a longer sight it does, for g_phi
-    decides where the path leads, and being where the sim is wrong would pay; then a baseline is left to V.
+
+        R_AT = -||f_psi(s, a) - s'||^2,
+
+    each dimension in units of `scale`: how much it changes in a real step. In raw units the fast
+    joints are all that counts, and what makes a robot fall, its slow root, is given up for them.
+    The target policy and the sim are g_phi's environment. R_AT is never positive, so an agent that
+    could end episodes would learn to: the task's falls are handed out as truncations, which TRPO
+    bootstraps like time limits.
+
+    baseline: count the reward from what a itself would have got in the sim,
+    -||f_psi(s, a) - guess||^2. For gamma 0 g_phi does not influence that. With a longer sight it
+    does, for g_phi decides where the path leads, and being where the sim is wrong would pay; then a
+    baseline is left to V.
     seed: of pi's noise; g_phi's own must come from another.
     """
 
@@ -192,17 +201,20 @@ class ActionTransformerEnv(VectorEnv):
         return self.sa.copy(), reward, np.zeros_like(done), done, {"next_obs": next_sa}
 
 
-# --- the methods -------------------------------------------------------------------------------------
+# --- the methods ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class GroundingSettings:
-    """What the grounding methods can be told. Where defaults differ from the paper's, README says why."""
+    """What the grounding methods can be told.
+
+    docs/paper.md says where defaults differ from the paper's, and why."""
 
     at: TRPOConfig = AT_CONFIG  # rgat: TRPO for the action transformer
     at_std: float = 0.01  # rgat: its initial standard deviation, in units of the action range
     residual: bool = True  # rgat and gat: f_psi corrects the sim's own prediction
-    per_step: bool = True  # rgat and oracle: R_AT in units of each dimension's change in a real step, not as it stands
+    # rgat, oracle: R_AT in units of each dimension's change in a real step, not as it stands
+    per_step: bool = True
     smoothing: float = 0.95  # gat: a_hat = smoothing * g(s, a) + (1 - smoothing) * a
     ane_width: float = (
         0.2  # ane: standard deviation of the action noise, in units of half the action range
@@ -210,7 +222,7 @@ class GroundingSettings:
 
 
 class Grounding:
-    """No grounding: the policy goes on learning in the world it is given (the `sim` and `real` lines)."""
+    """No grounding: the policy goes on learning in its world (the `sim` and `real` lines)."""
 
     learns_from_real = False
     least_transitions = 0  # real ones per grounding step, whatever the number of episodes
@@ -230,13 +242,15 @@ class Grounding:
         return {}
 
     def _measure_scale(self, tau_real):
-        """The unit of each dimension of R_AT, from the first real data: later, a robot that stands still would
-        make it vanishingly small."""
+        """The unit of each dimension of R_AT, from the first real data: later, a robot that stands
+        still would make it vanishingly small."""
         if self.settings.per_step and (self.scale == 1).all():
             self.scale = step_size(tau_real)
 
     def update(self, policy, steps, seed, on_update=None):
-        """Line 4: renew self.transformer with up to `steps` transitions in the sim. Returns statistics."""
+        """Line 4: renew self.transformer with up to `steps` transitions in the sim.
+
+        Returns statistics."""
         return {}
 
     def state(self):
@@ -248,7 +262,8 @@ class Grounding:
 
 
 class RGAT(Grounding):
-    """The paper's method: g_phi learnt end to end by TRPO on R_AT; f_psi enters the reward alone."""
+    """The paper's method: g_phi learnt end to end by TRPO on R_AT;
+    f_psi enters the reward alone."""
 
     learns_from_real = True
 
@@ -270,7 +285,7 @@ class RGAT(Grounding):
             sa = torch.from_numpy(np.concatenate((self.seen.s, self.seen.a), axis=1))
             for network in (self.learner.policy, self.learner.value):
                 network.normalizer.update(sa)
-        # exploration is renewed: with what TRPO leaves of it, a trust region would hold g_phi where it is
+        # exploration is renewed: with what TRPO leaves of it, g_phi would stay where it is
         with torch.no_grad():
             self.learner.policy.log_std.fill_(np.log(self.settings.at_std))
         baseline = self.real_model.residual and self.settings.at.gamma == 0
@@ -309,7 +324,9 @@ class RGAT(Grounding):
 
 
 class GAT(Grounding):
-    """Hanna and Stone 2017: g(s, a) = f_sim^-1(s, f_real(s, a)), each learnt by itself (paper, section II-C)."""
+    """Hanna and Stone 2017 (paper, section II-C): both functions of g(s, a) are fitted.
+
+    g(s, a) = f_sim^-1(s, f_real(s, a))"""
 
     learns_from_real = True
 
@@ -323,7 +340,7 @@ class GAT(Grounding):
         return {"forward_model_error": relative(self.real_model.fit(tau_real, seed), tau_real)}
 
     def update(self, policy, steps, seed, on_update=None):
-        """f_sim^-1 from as many transitions in the sim as the real data holds, but at most `steps` of them (and whole episodes)."""
+        """f_sim^-1 from whole episodes in the sim, as many transitions as real ones or `steps`."""
         episodes, tau_sim = 0, None
         while tau_sim is None or len(tau_sim) < min(steps, len(self.seen)):
             more = rollouts(policy, self.sim, self.sim.num_envs, seed + episodes)[1]
@@ -358,7 +375,8 @@ class GAT(Grounding):
 
 
 class ANE(Grounding):
-    """Action noise envelope (Jakobi 1995): no grounding, but a policy made robust by noise on its actions."""
+    """Action noise envelope (Jakobi 1995): no grounding, but a policy
+    robust to noise on actions."""
 
     def update(self, policy, steps, seed, on_update=None):
         rng = np.random.default_rng(seed)
@@ -377,8 +395,9 @@ class ANE(Grounding):
 class Solver(Grounding):
     """The delta_a that best takes the sim to a target, solved for step by step instead of learnt.
 
-    A Gauss-Newton step on ||s'_sim(a_hat) - target||^2, in the units of R_AT, whole, halved or not at all, whichever lands
-    nearest; derivatives by finite differences in a batch, from the sim's full state.
+    A Gauss-Newton step on ||s'_sim(a_hat) - target||^2, in the units of R_AT, whole, halved or not
+    at all, whichever lands nearest; derivatives by finite differences in a batch, from the sim's
+    full state.
     """
 
     epsilon = 0.05  # finite difference, in units of the action range
@@ -390,11 +409,13 @@ class Solver(Grounding):
         self.trial = Batch(sim.model, sim.num_envs * 2, nthread)
 
     def _target(self, action):
-        """Where each simulation should be after one step under action (n, nact): (n, 1, nobs), in units of scale."""
+        """Where one step under action (n, nact) should end: (n, 1, nobs), in units of scale."""
         raise NotImplementedError
 
     def _after(self, batch, actions):
-        """Observations (n, k, nobs), in units of scale, one step after the sim's present states under actions (n, k, nact)."""
+        """One step from the sim's present states under actions (n, k, nact).
+
+        Returns observations (n, k, nobs), in units of scale."""
         n, k, _ = actions.shape
         batch.state[:] = np.repeat(self.sim.batch.state, k, axis=0)
         batch.ctrl = actions.reshape(n * k, -1)
@@ -453,10 +474,10 @@ class Oracle(Solver):
 
 
 class Solved(Solver):
-    """RGAT's g_phi with a label instead of a reward: delta_a solved towards f_psi(s, a), then distilled into a network.
+    """RGAT's g_phi with a label instead of a reward: delta_a solved for, then distilled.
 
-    The solver needs the sim's full state and several of its steps for each one taken; the network (s, a) -> delta_a
-    that is fitted to what it said needs neither.
+    The solver needs the sim's full state and several of its steps for each one taken; the network
+    (s, a) -> delta_a that is fitted to what it said needs neither.
     """
 
     learns_from_real = True
@@ -474,7 +495,8 @@ class Solved(Solver):
         return (self.real_model(self.sim.observe(), action)[0] / self.scale)[:, None]
 
     def update(self, policy, steps, seed, on_update=None):
-        """Label the target policy's own (s, a) in the grounded sim, `steps` of them and whole episodes, and fit to them."""
+        """Label whole episodes of the policy in the grounded sim,
+        `steps` of them, and fit g_phi."""
         labels, episodes, count = [], 0, 0
 
         def told(obs, action):
@@ -551,15 +573,16 @@ def step_size(transitions):
 
 
 def relative(rms_error, transitions):
-    """RMS errors by dimension (nobs,) as one number, each in units of the dimension's step: 1 is no better than s' = s."""
+    """RMS errors by dimension (nobs,) as one number, in units of its step: 1 is that of s' = s."""
     return float(np.sqrt(((rms_error / step_size(transitions)) ** 2).mean()))
 
 
 def one_step_error(env, transformer, transitions, limit=4096):
     """How far the sim under a transformer lands from where the real world did.
 
-    Returns (error relative to the real step, RMS of ||a_hat - a||) over up to `limit` real transitions. Rows
-    whose velocities the observation clipped are left out: their state is not known.
+    Returns (error relative to the real step, RMS of ||a_hat - a||) over up to `limit` real
+    transitions. Rows whose velocities the observation clipped are left out: their state is not
+    known.
     """
     counted = env.counterfactual_steps  # to measure is not to learn
     rows = np.flatnonzero(measured(env, transitions.s))

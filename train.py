@@ -1,4 +1,4 @@
-"""Train a policy in simulation that works on the "real" robot: Algorithm 1 of the RGAT paper, and its rivals.
+"""Train a policy in simulation for the "real" robot: Algorithm 1 of the RGAT paper, and its rivals.
 
 python train.py --env Hopper-v4 --algo rgat
 python train.py --env InvertedPendulum-v4 --algo gat --seed 3 --out runs/pendulum
@@ -44,37 +44,41 @@ GROUNDINGS = {
     "physics+rgat": partial(PhysicsThen, RGAT),
     "physics+solved": partial(PhysicsThen, Solved),
 }
-UNSOUND = (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError)  # what a checkpoint of something else raises  # fmt: skip
+# what a checkpoint of something else raises
+UNSOUND = (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError)
 
 
-# --- Algorithm 1 --------------------------------------------------------------------------------------
+# --- Algorithm 1 ----------------------------------------------------------------------------------
 
 
 @torch_threads(1)
 def algorithm_1(s, run, bar):
-    """Algorithm 1 of the paper under settings s. Its results are left in run; a run begun earlier goes on."""
+    """Algorithm 1 of the paper under settings s: its results are left in
+    run, begun earlier or not."""
     sim = BatchEnv(s.env, s.num_envs, nthread=s.threads)
     real = RealData(s.real_data, sim) if s.real_data else real_world(s)
     learner, grounding, tau_real = start(s, run, sim, real, bar)
     policy = learner.policy
 
-    for step in range(
-        len(run.progress), s.grounding_steps + 1
-    ):  # 1: while the policy improves on real: here a fixed number of times
+    # 1: while the policy improves on real: here a fixed number of times
+    for step in range(len(run.progress), s.grounding_steps + 1):
         seeds = lambda purpose: seed_for(s.seed, step, purpose)
-        tau_new = collect(s, grounding, policy, real, seeds("collect"))  # 2: collect tau_real ...
-        tau_real += tau_new  # ... and keep what was collected before
-        stats = grounding.fit(tau_real, seeds("model"))  # 3: train f_psi with tau_real
+        # 2: collect tau_real, and keep what was collected before
+        tau_new = collect(s, grounding, policy, real, seeds("collect"))
+        tau_real += tau_new
+        # 3: train f_psi with tau_real
+        stats = grounding.fit(tau_real, seeds("model"))
+        # 4: update g_phi by optimize1
         stats |= update_transformer(
             s, grounding, policy, sim, real, seeds, bar.phase(step, "transformer")
-        )  # 4: update g_phi by optimize1
+        )
+        # 5: update pi_theta by optimize2, in the simulator that g_phi grounds
         grounded_sim = GroundedEnv(grounding.sim, grounding.transformer)
         learner.learn(
             grounded_sim, s.policy_steps, seeds("policy"), on_update=bar.phase(step, "policy")
-        )  # 5: update pi_theta by optimize2
-        record(
-            s, run, step, learner, grounding, real, tau_new, stats, bar
-        )  # 6: end while; the run keeps the best policy
+        )
+        # 6: end while; the run keeps the best policy
+        record(s, run, step, learner, grounding, real, tau_new, stats, bar)
 
 
 def real_world(s):
@@ -105,8 +109,10 @@ def nothing(env):
 
 
 def update_transformer(s, grounding, policy, sim, real, seeds, log):
-    """The action transformer goes on (or begins anew, as the method has it). Returns its statistics: among them the one-step
-    errors with it and without, on real transitions that nothing is fitted on and that no column counts."""
+    """The action transformer goes on, or begins anew, as the method has it.
+
+    Returns its statistics: among them the one-step errors with it and without, on real transitions
+    that nothing is fitted on."""
     stats = grounding.update(policy, s.at_steps, seeds("transformer"), log)
     if s.real_data:
         held_out = real.held_out()
@@ -124,7 +130,7 @@ def update_transformer(s, grounding, policy, sim, real, seeds, log):
 
 
 def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
-    """Judge the policy on real, and write down everything that the next step, or a resumed run, needs."""
+    """Judge the policy on real, and write down all that the next step, or a resumed run, needs."""
     returns, judging = judge(s, learner.policy, real, seed_for(s.seed, step, "evaluate"))
     steps, seconds = bar.lap()
     on_real = s.algo == "real"
@@ -183,7 +189,9 @@ def transforming(settings):
 
 
 def roll_back(s, run, learner, reached):
-    """The paper's "while the policy improves on real": the grounding step that the learner was put back to, or "" for none."""
+    """The paper's "while the policy improves on real": a policy that got worse is put back.
+
+    Returns the grounding step that the learner was put back to, or "" for none."""
     if not s.roll_back or not run.progress:
         return ""
     best = run.returns()[run.best()]
@@ -197,11 +205,12 @@ def standard_error(x):
     return float(x.std(ddof=1) / np.sqrt(len(x))) if len(x) > 1 else 0.0
 
 
-# --- where a run begins -------------------------------------------------------------------------------
+# --- where a run begins ---------------------------------------------------------------------------
 
 
 def start(s, run, sim, real, bar):
-    """The learner, the grounding and tau_real that the next grounding step goes on from; step 0 if there is none yet."""
+    """The learner, the grounding and tau_real to go on from; step 0 is
+    done if there is none yet."""
     world, method = real if s.algo == "real" else sim, GROUNDINGS[s.algo]
     learner = new_learner(s)  # seeds torch for the grounding's networks too
     told = (real.model,) if s.algo == "oracle" else ()
@@ -241,7 +250,7 @@ def start(s, run, sim, real, bar):
 
 
 def reference(s, run, learner, real, bar):
-    """The green line: what a policy trained from scratch on real, for --reference-steps, returns there."""
+    """The green line: the return on real of a policy trained there, for --reference-steps."""
     if s.real_data:
         return
     if s.algo != "real":
@@ -299,7 +308,9 @@ def given_policy(s, learner):
 
 
 def pretrained(s, world, env, steps, bar):
-    """TRPO from scratch in a world, "sim" or "real": the learner's state. Runs that name one --pretrained folder share it."""
+    """TRPO from scratch in a world, "sim" or "real": the learner's state.
+
+    Runs that name one --pretrained folder share it. Raises RunError where it cannot be kept."""
     changes = s.real if world == "real" else ""
     known = {k: v for k, v in versions().items() if k != "grounding"}
     task = Path(s.task).read_text() if s.task else ""
@@ -346,11 +357,12 @@ def pretrained(s, world, env, steps, bar):
     return learner.state()
 
 
-# --- the command line ---------------------------------------------------------------------------------
+# --- the command line -----------------------------------------------------------------------------
 
 
 def verdict(s, run):
-    """The best policy judged once more, on real episodes that did not choose it: best.json, and a line that says so."""
+    """The best policy judged on real episodes that did not choose it:
+    best.json, and a line to print."""
     step, policy = run.best(), run.policy()
     if s.real_data:
         rows, error = run.progress[-1]["real_transitions"], run.progress[-1]["at_one_step_error"]
@@ -371,12 +383,18 @@ def verdict(s, run):
         "real_transitions_judging": len(seen),
     }
     write_whole(run.folder / "best.json", json.dumps(best, indent=1))
-    shown = f"{best['real_return_deterministic']:.0f} ± {best['se']:.0f} on {len(returns)} fresh episodes"
+    shown = (
+        f"{best['real_return_deterministic']:.0f} ± {best['se']:.0f} "
+        f"on {len(returns)} fresh episodes"
+    )
     untouched, line = (
         float(run.progress[0]["real_return_deterministic"]),
         run.lines["trained on real"],
     )
-    return f"{run.folder}: best on real after grounding step {step}: {shown} (before grounding {untouched:.0f}, trained on real {line:.0f})"
+    return (
+        f"{run.folder}: best on real after grounding step {step}: {shown} "
+        f"(before grounding {untouched:.0f}, trained on real {line:.0f})"
+    )
 
 
 def replay(folder):
@@ -404,7 +422,9 @@ class Parser(argparse.ArgumentParser):
 
 
 def parse(argv):
-    """The parsed command line: every field of Settings, and what to do with which run. Raises RunError where it makes no sense."""
+    """The parsed command line: every field of Settings, and what to do with which run.
+
+    Raises RunError where it makes no sense."""
     parser = Parser(
         prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -446,7 +466,8 @@ def parse(argv):
         given = [name for name in given if name != "grounding_steps"]
     if given and (args.resume or args.replay):
         raise RunError(
-            f"--{given[0].replace('_', '-')} cannot be changed: a run goes on in its folder with the settings it began with "
+            f"--{given[0].replace('_', '-')} cannot be changed: "
+            "a run goes on in its folder with the settings it began with "
             "(but for more --grounding-steps); leave it out"
         )
     if args.tensorboard and importlib.util.find_spec("tensorboard") is None:
@@ -457,14 +478,15 @@ def parse(argv):
 
 
 def resumed(folder, grounding_steps=None):
-    """A run of this version and its settings, to go on to as many grounding steps (None: as it began with)."""
+    """A run of this version, and its settings up to as many steps (None: as it began with)."""
     run, saved = Run.open(folder)
     s = settings_of(folder, saved)
     run.require_this_version()
     if grounding_steps is not None:
         if grounding_steps < len(run.progress) - 1:
             raise RunError(
-                f"{folder} has done {len(run.progress) - 1} grounding steps: --grounding-steps can only add to them"
+                f"{folder} has done {len(run.progress) - 1} grounding steps: "
+                "--grounding-steps can only add to them"
             )
         s = dataclasses.replace(s, grounding_steps=grounding_steps)
         run.write_config(dataclasses.asdict(s))
@@ -472,7 +494,9 @@ def resumed(folder, grounding_steps=None):
 
 
 def main(argv=None):
-    """The command; returns its exit status. 0: done; 2: a request that cannot be met, told in one line; 130: Ctrl-C."""
+    """The command; returns its exit status.
+
+    0: done; 2: a request that cannot be met, told in one line; 130: Ctrl-C."""
     run = None
     try:
         args = parse(argv)

@@ -1,14 +1,15 @@
-"""Trust region policy optimisation (Schulman et al. 2015) with GAE(lambda), for any batched environment.
+"""Trust region policy optimisation (Schulman et al. 2015) with GAE(lambda), in batches.
 
     learner = TRPO(policy, value, TRPOConfig())
     learner.learn(env, steps=1_000_000, seed=0, on_update=print)
 
 The environment is a gymnasium VectorEnv in SAME_STEP autoreset mode. Each update solves
 
-    max_theta  E[pi_theta/pi_old * A] + entropy * H(pi_theta)   s.t.  E[KL(pi_old || pi_theta)] <= max_kl
+    max_theta  E[pi_theta/pi_old * A] + entropy * H(pi_theta)
+    s.t.       E[KL(pi_old || pi_theta)] <= max_kl
 
-to first order: conjugate gradient on the Fisher matrix gives the direction, the constraint the length, and a
-line search the largest step that really keeps both promises.
+to first order: conjugate gradient on the Fisher matrix gives the direction, the constraint the
+length, and a line search the largest step that really keeps both promises.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -59,7 +60,7 @@ PRESETS = {
 }
 
 
-# the target's and the transformer's learner where the paper's own settings are asked for: stable-baselines 2's defaults
+# both learners where the paper's own settings are asked for: stable-baselines 2's defaults
 STABLE_BASELINES = TRPOConfig(
     batch_size=1024,
     lam=0.98,
@@ -73,14 +74,14 @@ STABLE_BASELINES = TRPOConfig(
 )
 
 
-# --- the pieces ---------------------------------------------------------------------------------------
+# --- the pieces -----------------------------------------------------------------------------------
 
 
 def gae(reward, value, next_value, terminated, done, gamma, lam):
-    """Generalised advantage estimates (Schulman et al. 2016, eq. 16); all arrays (T, N), returns (T, N).
+    """Generalised advantage estimates (Schulman et al. 2016, eq. 16), (T, N) like every argument.
 
-    next_value is V of the true successor, so an episode cut by its time limit (done, not terminated) is
-    bootstrapped and one that terminated is not.
+    next_value is V of the true successor, so an episode cut by its time limit (done, not
+    terminated) is bootstrapped and one that terminated is not.
     """
     delta = reward + gamma * next_value * ~terminated - value
     advantage = np.zeros_like(delta)
@@ -115,11 +116,11 @@ def conjugate_gradient(product, b, steps, tolerance=1e-10):
 
 
 def fisher_product(policy, obs, damping):
-    """v -> (F + damping I) v, F the Fisher matrix of the policy at its present parameters, over obs (N, nobs).
+    """v -> (F + damping I) v, F the Fisher matrix of the policy as it is, over obs (N, nobs).
 
-    For a Gaussian, F is the mean over obs of J' diag(1/sigma^2) J, J the Jacobian of the action's mean, and 2 for
-    each log sigma: what the Hessian of KL(pi || pi_theta) at theta = pi comes to (its gradient is 0 there). F is never
-    formed: J v and J' u are found layer by layer.
+    For a Gaussian, F is the mean over obs of J' diag(1/sigma^2) J, J the Jacobian of the action's
+    mean, and 2 for each log sigma: what the Hessian of KL(pi || pi_theta) at theta = pi comes to
+    (its gradient is 0 there). F is never formed: J v and J' u are found layer by layer.
     """
     net, log_std = policy.net, policy.log_std.detach()  # in parameters() log_std comes first
     weights = list(net.parameters())
@@ -137,11 +138,14 @@ def fisher_product(policy, obs, damping):
 
 
 def policy_update(policy, obs, action, advantage, config):
-    """One TRPO step on the policy, in place. obs (N, nobs), action (N, nact), advantage (N,), torch tensors.
+    """One TRPO step on the policy, in place.
 
-    Returns a dict: kl, surrogate_gain, step_size (the fraction of the full step taken, 0 if none), line_search
-    ("accepted", "no gradient", "no curvature", "exhausted"), entropy. Parameters change only if the new ones
-    are finite, keep KL <= max_kl and better the surrogate; otherwise they are restored exactly.
+    Tensors: obs (N, nobs), action (N, nact), advantage (N,).
+
+    Returns a dict: kl, surrogate_gain, step_size (the fraction of the full step taken, 0 if none),
+    line_search ("accepted", "no gradient", "no curvature", "exhausted"), entropy. Parameters change
+    only if the new ones are finite, keep KL <= max_kl and better the surrogate; otherwise they are
+    restored exactly.
     """
     advantage = advantage.double()
     spread = advantage.std() if len(advantage) > 1 else torch.zeros(())
@@ -204,10 +208,10 @@ def policy_update(policy, obs, action, advantage, config):
 
 
 def value_update(value, optimizer, obs, returns, config, generator):
-    """A function that fits V to returns (N,) by minibatch Adam on the squared error, in the value's own scale.
+    """A function that fits V to returns (N,) by minibatch Adam, in the value's own scale.
 
-    Everything random or shared is settled before it is handed out: it may run beside the policy's update and the
-    next rollout, and the numbers do not depend on when.
+    Everything random or shared is settled before it is handed out: it may run beside the policy's
+    update and the next rollout, and the numbers do not depend on when.
     """
     value.returns.update(returns[:, None])
     inputs, target = (
@@ -232,7 +236,7 @@ def explained_variance(prediction, target):
     return float(1 - np.var(target - prediction) / var) if var > 0 else 0.0
 
 
-# --- the learner --------------------------------------------------------------------------------------
+# --- the learner ----------------------------------------------------------------------------------
 
 
 class TRPO:
@@ -265,7 +269,7 @@ class TRPO:
         return max(1, self.config.batch_size // env.num_envs) * env.num_envs
 
     def learn(self, env, steps, seed, freeze_normalizer=True, on_update=None, critic_alone=False):
-        """Train on env for at least `steps` transitions, in whole batches; seed decides every random number.
+        """Train on env for at least `steps` transitions, in whole batches; seed decides all chance.
 
         freeze_normalizer: keep the observation statistics as they are. critic_alone: keep the
         policy, which came without a critic: an improvement by one that knows nothing yet would ruin
@@ -297,7 +301,7 @@ class TRPO:
             value_fit.result()
 
     def collect(self, env, obs, horizon):
-        """Act for `horizon` steps. Returns arrays (T, N, ...) by name, and the observation to go on from."""
+        """Act for `horizon` steps. Returns arrays (T, N, ...) by name, and the last observation."""
         low, high = env.single_action_space.low, env.single_action_space.high
         act, rows = self.policy.sampler(self.generator), []
         for _ in range(horizon):
@@ -344,7 +348,8 @@ class TRPO:
         ), value
 
     def update(self, batch, beside, critic_alone=False):
-        """Update the policy from collect()'s arrays and start fitting the value in `beside`, an executor.
+        """Update the policy from collect()'s arrays; start to fit the
+        value in `beside`, an executor.
 
         Returns the statistics to log, and the future that ends with the fit.
         """
@@ -365,7 +370,9 @@ class TRPO:
 
 
 def successors(obs, info):
-    """Every transition's true successor (N, nobs): info["next_obs"], or what gymnasium's own SAME_STEP environments say."""
+    """Every transition's true successor (N, nobs).
+
+    That is info["next_obs"], or what gymnasium's own SAME_STEP environments say."""
     if "next_obs" in info:
         return info["next_obs"]
     after = np.array(obs)
@@ -392,10 +399,11 @@ class EpisodeReturns:
 
 
 def rollouts(policy, env, episodes, seed, deterministic=False):
-    """Run `episodes` whole episodes of a policy. Returns their undiscounted returns (episodes,) and Transitions.
+    """Run `episodes` whole episodes of a policy.
 
-    Each environment plays one episode after each reset, so that short episodes are not favoured. The rows of
-    an episode stand together, in their order in time.
+    Returns their undiscounted returns (episodes,) and Transitions. Each environment plays one
+    episode after each reset, so that short episodes are not favoured. The rows of an episode stand
+    together, in their order in time.
     """
     generator = torch.Generator().manual_seed(seed)
     low, high = env.single_action_space.low, env.single_action_space.high
@@ -425,7 +433,7 @@ def rollouts(policy, env, episodes, seed, deterministic=False):
 
 @dataclass(frozen=True)
 class Transitions:
-    """Real or simulated experience {((s, a), s')}: float32 arrays (N, nobs), (N, nact), (N, nobs)."""
+    """Experience {((s, a), s')}, real or not: float32 arrays (N, nobs), (N, nact), (N, nobs)."""
 
     s: np.ndarray
     a: np.ndarray

@@ -1,4 +1,5 @@
-"""Algorithm 1 itself: which world, seeds and data each of its phases used, seen by a spy; nothing is learnt here."""
+"""Algorithm 1 itself: which world, seeds and data each of its phases used,
+seen by a spy; nothing is learnt here."""
 
 import dataclasses
 
@@ -17,7 +18,8 @@ STEPS, ENVS, PRETRAIN, REFERENCE, POLICY, AT, TRAJECTORIES, EPISODES = 2, 4, 40,
 
 
 def world(env):
-    """What an environment is: "sim", "real", or the world below a transformer and the transformer."""
+    """What an environment is: "sim", "real", or the world below a
+    transformer and the transformer."""
     if isinstance(env, GroundedEnv):
         return world(env.env), env.transformer
     return "real" if env.model.body("pole").mass[0] == 100 else "sim"
@@ -233,7 +235,7 @@ def test_short_episodes_are_collected_until_there_are_enough():
     assert len(np.unique(starts, axis=0)) == len(starts) > 1  # each episode another
 
 
-# --- every option reaches its object ------------------------------------------------------------------
+# --- every option reaches its object --------------------------------------------------------------
 
 REACHED = {
     "at_max_kl": (0.5, lambda s: s.grounding.at.max_kl),

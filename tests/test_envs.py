@@ -1,4 +1,5 @@
-"""BatchEnv against gymnasium's own environments, perturbations against edited MJCF, grounding against the raw sim."""
+"""BatchEnv against gymnasium's own environments, perturbations against edited MJCF, grounding
+against the raw sim."""
 
 import xml.etree.ElementTree as ET
 
@@ -27,7 +28,9 @@ def stock(env_id, n, **kwargs):
 
 
 def replay_both(env_id, policy, steps, n=3, seed=11, **kwargs):
-    """Step both worlds through the same actions, requiring equality throughout. Returns (terminations, truncations)."""
+    """Step both worlds through the same actions, requiring equality throughout.
+
+    Returns (terminations, truncations)."""
     ours, theirs = BatchEnv(env_id, n, nthread=1), stock(env_id, n, **kwargs)
     obs, _ = ours.reset(seed=seed)
     np.testing.assert_array_equal(obs, theirs.reset(seed=seed)[0])
@@ -127,7 +130,7 @@ def test_the_returned_arrays_are_the_callers_own():
     np.testing.assert_array_equal(info["next_obs"], kept_next)
 
 
-# --- the "real" world ---------------------------------------------------------------------------------
+# --- the "real" world -----------------------------------------------------------------------------
 
 
 def tree_of(env_id):
@@ -395,7 +398,7 @@ def test_steps_that_are_not_taken_are_counted():
     assert env.counterfactual_steps == 12
 
 
-# --- the grounded simulator ---------------------------------------------------------------------------
+# --- the grounded simulator -----------------------------------------------------------------------
 
 
 def silent_transformer(nobs, space):

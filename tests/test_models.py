@@ -1,4 +1,5 @@
-"""Networks against torch.distributions and numpy; regressors on systems with a known answer; checkpoints good and bad."""
+"""Networks against torch.distributions and numpy; regressors on systems with a known answer;
+checkpoints good and bad."""
 
 import subprocess
 import sys
@@ -168,7 +169,7 @@ def test_value_speaks_in_units_of_reward():
     )
 
 
-# --- supervised models --------------------------------------------------------------------------------
+# --- supervised models ----------------------------------------------------------------------------
 
 
 def linear_system(n=3000, seed=0):
@@ -243,7 +244,7 @@ def test_fit_normalises_by_the_training_rows():
     )
 
 
-# --- checkpoints --------------------------------------------------------------------------------------
+# --- checkpoints ----------------------------------------------------------------------------------
 
 
 def test_a_network_lies_in_memory_as_one_vector_whatever_became_of_it():

@@ -1,4 +1,5 @@
-"""Grounding methods: rewards and transformers by hand, the oracle against brute force, strangers training in the grounded sim."""
+"""Grounding methods: rewards and transformers by hand, the oracle against brute force, strangers
+training in the grounded sim."""
 
 import copy
 from dataclasses import replace
@@ -135,7 +136,7 @@ def test_action_transformer_adds_its_mean_and_stays_in_bounds():
     )
 
 
-# --- f_psi --------------------------------------------------------------------------------------------
+# --- f_psi ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("residual", [False, True])
@@ -187,7 +188,7 @@ def test_predict_all_goes_through_a_ragged_number_of_rows():
         )
 
 
-# --- the methods --------------------------------------------------------------------------------------
+# --- the methods ----------------------------------------------------------------------------------
 
 
 def test_no_grounding_is_the_raw_sim():
@@ -326,7 +327,7 @@ def test_gats_inverse_is_fitted_on_the_sims_transitions(monkeypatch):
     np.testing.assert_allclose(after, s_next, atol=1e-5)
 
 
-# --- solved -------------------------------------------------------------------------------------------
+# --- solved ---------------------------------------------------------------------------------------
 
 
 def test_solved_takes_the_sim_to_what_f_psi_says():
@@ -426,7 +427,7 @@ def test_one_step_error_is_naught_in_the_same_world():
     assert one_step_error(sim, identity, tau)[0] < 1e-4  # what float32 keeps of the states
 
 
-# --- strangers ----------------------------------------------------------------------------------------
+# --- strangers ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", ["InvertedPendulum-v4", "Hopper-v5"])

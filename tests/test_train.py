@@ -1,4 +1,5 @@
-"""The command: every algorithm end to end, a run cut off anywhere and resumed, bad input, replay."""
+"""The command: every algorithm end to end, a run cut off anywhere and
+resumed, bad input, replay."""
 
 import csv
 import errno
@@ -228,7 +229,8 @@ def cut_off_at(monkeypatch, owner, name, count, error):
     monkeypatch.setattr(owner, name, wrapped)
 
 
-# TRPO updates of the rgat run: 1 pretraining, 2 reference, 3 transformer and 4 policy of step 1, 5 and 6 of step 2
+# TRPO updates of the rgat run: 1 pretraining, 2 reference, 3 transformer and 4 policy of step 1, 5
+# and 6 of step 2
 @pytest.mark.parametrize(
     "algo, update",
     [("rgat", k) for k in (1, 2, 4, 5, 6)]

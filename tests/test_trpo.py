@@ -1,4 +1,5 @@
-"""TRPO's pieces against closed forms, plain loops and torch.distributions; the learner on environments with known answers."""
+"""TRPO's pieces against closed forms, plain loops and torch.distributions; the learner on
+environments with known answers."""
 
 import copy
 import io
@@ -35,11 +36,12 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 seeds = st.integers(0, 2**31 - 1)
 
 
-# --- GAE ----------------------------------------------------------------------------------------------
+# --- GAE ------------------------------------------------------------------------------------------
 
 
 def plain_gae(reward, value, next_value, terminated, done, gamma, lam):
-    """The sum of (gamma lam)^l delta_{t+l} to the episode's end, written out for one environment."""
+    """The sum of (gamma lam)^l delta_{t+l} to the episode's end,
+    written out for one environment."""
     T = len(reward)
     advantage = np.zeros(T)
     for t in range(T):
@@ -82,7 +84,7 @@ def test_an_episodes_end_keeps_the_next_episode_out():
     np.testing.assert_array_equal(gae(reward, zero, zero, no, done, 0.99, 0.95)[:2], 0)
 
 
-# --- conjugate gradient and Fisher product ------------------------------------------------------------
+# --- conjugate gradient and Fisher product --------------------------------------------------------
 
 
 @given(seeds, st.integers(1, 12))
@@ -107,7 +109,8 @@ def flat(module):
 
 
 def kl_hessian(policy, obs):
-    """The Hessian of the mean KL to the policy as it is, over all parameters, by torch.distributions and double backward."""
+    """The Hessian of the mean KL to the policy as it is, over all parameters, by
+    torch.distributions and double backward."""
     names = [n for n, _ in policy.named_parameters()]
     shapes = [p.shape for p in policy.parameters()]
 
@@ -141,11 +144,12 @@ def test_fisher_product_equals_the_explicit_hessian(seed):
     assert torch.linalg.eigvalsh(H).min() > -1e-10
 
 
-# --- one update of the policy -------------------------------------------------------------------------
+# --- one update of the policy ---------------------------------------------------------------------
 
 
 def mean_kl_and_log_prob(policy, old_mean, old_log_std, obs, action):
-    """KL to the old policy and the new log-probabilities, by torch.distributions in double precision."""
+    """KL to the old policy and the new log-probabilities, by
+    torch.distributions in double precision."""
     with torch.no_grad():
         mean, log_std = (x.double() for x in policy(obs))
     old = torch.distributions.Normal(
@@ -325,7 +329,7 @@ def test_explained_variance():
     assert explained_variance(target, np.ones(1000)) == 0
 
 
-# --- the learner --------------------------------------------------------------------------------------
+# --- the learner ----------------------------------------------------------------------------------
 
 
 class Corridor(VectorEnv):
@@ -459,7 +463,8 @@ def test_learners_and_fits_do_not_depend_on_torchs_threads():
 
 
 class ChainEnv:
-    """Two states in turn, reward 1 in the first and 3 in the second, for 200 steps that a time limit cuts."""
+    """Two states in turn, reward 1 in the first and 3 in the second, for
+    200 steps that a time limit cuts."""
 
     num_envs = 4
     single_observation_space = Box(-1, 1, (2,), np.float32)

@@ -1,9 +1,10 @@
-"""The paper's claims against the rows that were measured: results/claims.csv, the figures, and docs/results.md's tables.
+"""The paper's claims against the rows that were measured: results/claims.csv,
+the figures, and docs/results.md's tables.
 
-Each claim is a number per seed, positive where the claim is so. Its test is a permutation test over seeds: under no
-effect each seed's number is as likely with the other sign. p is one-sided and corrected over all
-claims that have seeds enough to be tested (Holm).
-Rows of different versions are never put together: of each experiment the version with the most runs counts.
+Each claim is a number per seed, positive where the claim is so. Its test is a permutation test over
+seeds: under no effect each seed's number is as likely with the other sign. p is one-sided and
+corrected over all claims that have seeds enough to be tested (Holm). Rows of different versions are
+never put together: of each experiment the version with the most runs counts.
 """
 
 import re
@@ -27,11 +28,12 @@ FEWEST = 5  # seeds of a claim that is tested: fewer cannot bring p below 0.05
 REACHED = 0.9  # of the line of a policy trained on real: what counts as reaching it
 
 
-# --- the rows of an experiment ------------------------------------------------------------------------
+# --- the rows of an experiment --------------------------------------------------------------------
 
 
 class Data:
-    """The rows of one experiment and one version: returns (rounds,) by arm and seed, and reference lines by seed."""
+    """The rows of one experiment and one version: returns (rounds,) by arm and
+    seed, and reference lines by seed."""
 
     def __init__(self, rounds, judged):
         self.returns, self.errors = defaultdict(dict), defaultdict(dict)
@@ -48,7 +50,8 @@ class Data:
         self.commits = sorted({row["commit"] for row in rounds})
 
     def paired(self, *arms):
-        """Seeds that all arms have, over as many rounds as all of them have: [arrays (seeds, rounds)], seeds."""
+        """Seeds that all arms have, over as many rounds as all of them have:
+        [arrays (seeds, rounds)], seeds."""
         seeds = sorted(set.intersection(*(set(self.returns[arm]) for arm in arms)))
         if not seeds:
             return [np.empty((0, 1)) for _ in arms], []
@@ -61,7 +64,8 @@ class Data:
         return np.array(next((list(self.lines[a].values()) for a in arms if self.lines[a]), []))
 
     def with_lines(self, arm):
-        """Returns (seeds, rounds) of an arm and the reference lines (seeds,) of the seeds that have one."""
+        """Returns (seeds, rounds) of an arm and the reference lines (seeds,)
+        of the seeds that have one."""
         [returns], seeds = self.paired(arm)
         lines = self.lines[arm]
         keep = [k for k, seed in enumerate(seeds) if seed in lines]
@@ -85,12 +89,13 @@ def by_experiment(rounds, judged):
     return found
 
 
-# --- the claims ---------------------------------------------------------------------------------------
+# --- the claims -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Claim:
-    """values(data) -> (seeds,), positive where the claim is so; choice: what the verdict hangs on."""
+    """values(data) -> (seeds,), positive where the claim is so; choice:
+    what the verdict hangs on."""
 
     experiment: str
     text: str
@@ -126,7 +131,8 @@ def above(arm, other):
 
 
 def best_width(data):
-    """The width of the action noise envelope with the best mean return in the last round, as the paper reports it."""
+    """The width of the action noise envelope with the best mean return in the
+    last round, as the paper reports it."""
     arms = [f"ane {w:g}" for w in WIDTHS if data.returns[f"ane {w:g}"]]
     last = lambda arm: np.mean([returns[-1] for returns in data.returns[arm].values()])
     return max(arms, key=last) if arms else "ane"
@@ -140,7 +146,8 @@ def more_precise(data):
 
 
 def precision_explains(data):
-    """Rank correlation, in each seed over methods and rounds, of a small one-step error with a high return."""
+    """Rank correlation, in each seed over methods and rounds, of a small
+    one-step error with a high return."""
     arms = [arm for arm in data.returns if arm not in ("real", "rgat, rolled back")]
     seeds = set.intersection(*(set(data.returns[arm]) for arm in arms)) if arms else ()
     pairs = lambda k: np.array([p for arm in arms for p in zip(data.errors[arm][k][1:], data.returns[arm][k][1:])])  # fmt: skip
@@ -148,7 +155,8 @@ def precision_explains(data):
 
 
 def shallow_fails(data):
-    """How far a shallow policy trained on real stays below half of what a deep one returns there."""
+    """How far a shallow policy trained on real stays below half of what
+    a deep one returns there."""
     out = []
     for env in ("Hopper-v4", "HalfCheetah-v4"):
         (shallow, deep), _ = data.paired(f"{env}, shallow", f"{env}, deep")
@@ -157,7 +165,8 @@ def shallow_fails(data):
 
 
 def sim_costs(data):
-    """The part of the reference line that the sim's policy lacks on real before any grounding, less 30 %."""
+    """The part of the reference line that the sim's policy lacks on real
+    before any grounding, less 30 %."""
     returns, line = data.with_lines("sim")
     return (line - returns[:, 0]) / np.abs(line) - 0.3
 
@@ -218,11 +227,12 @@ def transformer_claims(rows):
     return found
 
 
-# --- the verdicts -------------------------------------------------------------------------------------
+# --- the verdicts ---------------------------------------------------------------------------------
 
 
 def permutation_p(values):
-    """One-sided p of mean(values) > 0 if each sign is a coin's: exact up to 14 seeds, 100 000 draws beyond."""
+    """One-sided p of mean(values) > 0 if each sign is a coin's: exact up to 14
+    seeds, 100 000 draws beyond."""
     n = len(values)
     if n == 0:
         return float("nan")
@@ -254,7 +264,8 @@ def holm(p):
 
 
 def verdict(high, p_corrected, n):
-    """holds: shown; does not hold: the interval has no room for it; undecided: neither, or too few seeds."""
+    """holds: shown; does not hold: the interval has no room for it;
+    undecided: neither, or too few seeds."""
     if n >= FEWEST and p_corrected < 0.05:
         return "holds"
     return "does not hold" if n >= FEWEST and high <= 0 else "undecided"
@@ -285,11 +296,12 @@ def table(rounds, judged, transformers):
     return out
 
 
-# --- what a reader sees -------------------------------------------------------------------------------
+# --- what a reader sees ---------------------------------------------------------------------------
 
 
 def report(results):
-    """Write results/claims.csv, results/rounds.png, and the tables of docs/results.md, from the CSVs in a folder."""
+    """Write results/claims.csv, results/rounds.png, and the tables of docs/results.md, from the
+    CSVs in a folder."""
     rounds, judged, transformers = (read(results / f"{n}.csv") for n in ("rounds", "judged", "transformers"))  # fmt: skip
     transformers = [row for row in transformers if "version" in row]
     rows = table(rounds, judged, transformers)
@@ -323,7 +335,8 @@ def claims_markdown(claims):
 
 
 def rounds_markdown(rounds, judged):
-    """A table per experiment: mean ± standard error over seeds of the return on real, before and after."""
+    """A table per experiment: mean ± standard error over seeds of the
+    return on real, before and after."""
     out = []
     for name, data in by_experiment(rounds, judged).items():
         out += [f"\n### {name.capitalize()}\n", f"Version {data.version}, commit {', '.join(data.commits)}.", ""]  # fmt: skip
@@ -362,7 +375,8 @@ def pm(values, digits=0):
 
 
 def draw(experiments, path):
-    """One panel per experiment: mean over seeds and standard error, and the line of a policy trained on real."""
+    """One panel per experiment: mean over seeds and standard error, and the
+    line of a policy trained on real."""
     import io
 
     across = min(3, len(experiments))

@@ -24,7 +24,8 @@ class Arm:
 
     @property
     def key(self):
-        """A hash of what decides the numbers of this arm beside the seed: runs of other settings are other runs."""
+        """A hash of what decides the numbers of this arm beside the seed: runs
+        of other settings are other runs."""
         told = {k: v for k, v in asdict(self.of(0)).items() if k not in FREE}
         return hashlib.sha256(repr(sorted(told.items())).encode()).hexdigest()[:8]
 

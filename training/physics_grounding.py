@@ -1,7 +1,8 @@
-"""Grounding by diagnosis: instead of transforming actions, put the physics that was left out into the simulator.
+"""Grounding by diagnosis: not actions are transformed, but missing physics is put into the sim.
 
-The real trajectories become recordings, diagnose() finds what they show to be missing, and its corrected model
-becomes the world in which the policy improves. It sees what the other methods see: observations and actions.
+The real trajectories become recordings, diagnose() finds what they show to be missing, and its
+corrected model becomes the world in which the policy improves. It sees what the other methods see:
+observations and actions.
 """
 
 import mujoco
@@ -24,10 +25,10 @@ class Physics(Grounding):
         self.nominal, self.xml = sim, ""
 
     def fit(self, tau_real, seed):
-        """Line 3: from the raw simulator and all that was recorded so far, the simulator with the missing physics.
+        """Line 3: the raw simulator with the physics that all recordings so far show to be missing.
 
-        The last one stays where it predicts the recorded transitions better than the new one, or where that has
-        joints that the task does not know, as backlash and dead zones are written.
+        The last one stays where it predicts the recorded transitions better than the new one, or
+        where that has joints that the task does not know, as backlash and dead zones are written.
         """
         path = model_path(self.nominal.env_id)
         try:
@@ -109,7 +110,9 @@ class PhysicsThen(Physics):
 
 
 def recordings_of(env, transitions):
-    """Transitions as Recordings, one per episode. What the observation leaves out or clips counts as not measured."""
+    """Transitions as Recordings, one per episode.
+
+    What the observation leaves out or clips counts as not measured."""
     task, nq, nv = env.task, env.model.nq, env.model.nv
     first = np.flatnonzero(np.r_[True, (transitions.s[1:] != transitions.s_next[:-1]).any(axis=1)])
     recordings = []

@@ -1,4 +1,5 @@
-"""Tables of finished runs: which rows there are, of which version, and how those of two machines come together."""
+"""Tables of finished runs: which rows there are, of which version, and how
+those of two machines come together."""
 
 import csv
 import json
@@ -44,7 +45,8 @@ def write(path, rows, columns):
 
 
 def merge(path, others):
-    """The rows of a CSV and of another (or of a list): of a run that both hold, the ones that went further."""
+    """The rows of a CSV and of another (or of a list): of a run that both
+    hold, the ones that went further."""
     found = {}
     for rows in (read(path), others if isinstance(others, list) else read(others)):
         runs = {}
@@ -70,7 +72,8 @@ def finished(path, job, version):
 
 
 def rows_of(job, version, commit):
-    """What a job's folder holds: rows for rounds.csv, and for judged.csv where the run has ended."""
+    """What a job's folder holds: rows for rounds.csv, and for
+    judged.csv where the run has ended."""
     s = job.settings
     key = dict(
         zip(

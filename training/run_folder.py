@@ -1,4 +1,5 @@
-"""A run on disk: settings, tables, checkpoints, figure and animation; everything is written whole or not at all.
+"""A run on disk: settings, tables, checkpoints, figure and animation; everything is written whole
+or not at all.
 
 And what is seen of it meanwhile: the progress bar.
 """
@@ -84,10 +85,11 @@ def statements(text):
 class Run:
     """The folder of one run.
 
-    config.json (settings and versions), progress.csv (a row per grounding step), train.csv (a row per TRPO update),
-    step_NN.pt (checkpoints), real_NN.npz (the real transitions collected in step NN), policy.pt (the best policy so far
-    on real), best.json (that policy judged once more), lines.json (reference returns), progress.png, replay.gif if asked
-    for, and ENV-sim-KEY.pt or ENV-real-KEY.pt, policies trained from scratch, where no other folder keeps them.
+    config.json (settings and versions), progress.csv (a row per grounding step), train.csv (a row
+    per TRPO update), step_NN.pt (checkpoints), real_NN.npz (the real transitions collected in step
+    NN), policy.pt (the best policy so far on real), best.json (that policy judged once more),
+    lines.json (reference returns), progress.png, replay.gif if asked for, and ENV-sim-KEY.pt or
+    ENV-real-KEY.pt, policies trained from scratch, where no other folder keeps them.
     """
 
     def __init__(self, folder):
@@ -97,7 +99,9 @@ class Run:
 
     @classmethod
     def create(cls, folder, settings):
-        """A new folder for a run with these settings (a dict). Raises RunError if it holds a run or cannot be made."""
+        """A new folder for a run with these settings (a dict).
+
+        Raises RunError if it holds a run or cannot be made."""
         run = cls(folder)
         try:
             if (run.folder / "config.json").exists():
@@ -119,7 +123,8 @@ class Run:
         write_whole(self.folder / "config.json", json.dumps(config, indent=1))
 
     def require_this_version(self):
-        """Raises RunError if the run was begun with other code or packages: its numbers would be of two kinds."""
+        """Raises RunError if the run was begun with other code or packages: its
+        numbers would be of two kinds."""
         for name, now in versions().items():
             then = self.versions.get(name)
             if name not in ("machine", "python") and then != now:
@@ -130,7 +135,9 @@ class Run:
 
     @classmethod
     def open(cls, folder):
-        """An existing run, cut back to its last whole grounding step. Returns it and its settings."""
+        """An existing run, cut back to its last whole grounding step.
+
+        Returns it and its settings."""
         run = cls(folder)
         try:
             config = json.loads((run.folder / "config.json").read_text())
@@ -169,7 +176,8 @@ class Run:
         self.plot()
 
     def record(self, row, checkpoint, real=None):
-        """Finish a grounding step: its data and checkpoint first, its progress row last, so that a row means a whole step."""
+        """Finish a grounding step: its data and checkpoint first, its progress row last, so that a
+        row means a whole step."""
         step = row["grounding_step"]
         if real is not None:
             data = io.BytesIO()
@@ -200,7 +208,8 @@ class Run:
             raise RunError(f"{error}; start a new run") from None
 
     def policy(self):
-        """The best policy so far. Raises RunError if there is none yet, or its file is missing or damaged."""
+        """The best policy so far. Raises RunError if there is none yet, or its
+        file is missing or damaged."""
         if not self.progress:
             raise RunError(f"{self.folder} has no policy yet: go on with --resume {self.folder}")
         try:
@@ -209,7 +218,9 @@ class Run:
             raise RunError(f"{self.folder}: {error}; start a new run") from None
 
     def real(self, step):
-        """The arrays s, a, s_next collected in a step. Raises RunError if they are missing or damaged."""
+        """The arrays s, a, s_next collected in a step.
+
+        Raises RunError if they are missing or damaged."""
         path = self.folder / f"real_{step:02d}.npz"
         try:
             with np.load(path, allow_pickle=False) as data:
@@ -225,7 +236,8 @@ class Run:
         write_whole(self.folder / "lines.json", json.dumps(self.lines, indent=1))
 
     def plot(self):
-        """progress.png: return on real against grounding step, and the training returns behind it."""
+        """progress.png: return on real against grounding step, and the
+        training returns behind it."""
         figure = Figure(figsize=(10, 4), layout="constrained")
         left, right = figure.subplots(1, 2)
         steps = [int(r["grounding_step"]) for r in self.progress]
@@ -277,7 +289,8 @@ def tensorboard(folder):
 
 
 class Bar:
-    """Progress on a terminal, train.csv and the figure along the way, and the steps and seconds of each grounding step."""
+    """Progress on a terminal, train.csv and the figure along the way, and the
+    steps and seconds of each grounding step."""
 
     def __init__(self, s, run, board=None):
         self.board = board
@@ -323,7 +336,8 @@ class Bar:
                 self.board.add_scalar(f"{group}/{key}", value, x)
 
     def skip(self, steps, counts=True):
-        """Steps that an earlier run has done; counts: they are this run's own, not a reference line's."""
+        """Steps that an earlier run has done; counts: they are this run's
+        own, not a reference line's."""
         self.seen += steps * counts
         for count in (
             ("initial", "n", "last_print_n") if not self.tqdm.disable else ()
@@ -340,7 +354,7 @@ class Bar:
         self.tqdm.write(line)
 
 
-# --- replay: the planar robots drawn from their geoms, with no need of OpenGL ------------------------
+# --- replay: the planar robots drawn from their geoms, with no need of OpenGL ---------------------
 
 
 SIZE, SCALE = (400, 300), 110  # of a frame in pixels, and pixels per metre
@@ -372,9 +386,11 @@ def draw(model, data, x, title):
 
 
 def animate(policy, worlds, path):
-    """A GIF of a policy acting in each of the worlds {title: BatchEnv with one environment}, side by side.
+    """A GIF of a policy acting in each of the worlds {title: BatchEnv with
+    one environment}, side by side.
 
-    Each world stops moving when its episode ends. Returns the returns reached within MOST steps, by title.
+    Each world stops moving when its episode ends. Returns the returns reached
+    within MOST steps, by title.
     """
     strips, returns = [], {}
     for title, env in worlds.items():

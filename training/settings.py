@@ -1,4 +1,5 @@
-"""What decides a run's numbers: the settings of the command line, the presets that fill them in, and the seeds."""
+"""What decides a run's numbers: the settings of the command line, the
+presets that fill them in, and the seeds."""
 
 import dataclasses
 import importlib.util
@@ -34,8 +35,9 @@ DEFAULTS = {
     "HalfCheetah": dict(grounding_steps=20, **LARGE),
 }
 
-# "tuned": what was found to work here; "paper": Algorithm 1 as printed, and where the paper is silent stable-baselines'
-# defaults, whose policies begin with a standard deviation of 1 in the action's own unit
+# "tuned": what was found to work here; "paper": Algorithm 1 as printed, and where the paper is
+# silent stable-baselines' defaults, whose policies begin with a standard deviation of 1 in the
+# action's own unit
 PRESET = {
     "tuned": dict(
         forward_model="residual",
@@ -165,7 +167,9 @@ class Settings:
         return self.env.split("-")[0]
 
     def completed(self):
-        """These settings with the preset's and the task's defaults filled in. Raises EnvError or RunError for impossible ones."""
+        """These settings with the preset's and the task's defaults filled in.
+
+        Raises EnvError or RunError for impossible ones."""
         if self.task:
             return dataclasses.replace(self, env=load_task(self.task))._filled()
         return self._filled()
@@ -306,6 +310,7 @@ PURPOSES = ("networks", "pretrain", "collect", "model", "transformer", "held out
 
 
 def seed_for(seed, step, purpose):
-    """An independent seed for each use in each grounding step, so that a resumed run draws the same numbers."""
+    """An independent seed for each use in each grounding step, so that a
+    resumed run draws the same numbers."""
     entropy = np.random.SeedSequence([seed, step, PURPOSES.index(purpose)])
     return int(entropy.generate_state(1)[0] >> 1)

@@ -1,4 +1,5 @@
-"""Grounding by diagnosis: what becomes a recording, and that the missing physics ends up in the simulator."""
+"""Grounding by diagnosis: what becomes a recording, and that the missing
+physics ends up in the simulator."""
 
 from types import SimpleNamespace
 
@@ -84,7 +85,8 @@ def test_a_diagnosis_that_predicts_worse_than_the_last_is_not_taken(monkeypatch)
 
 
 def with_pole(mass, joints):
-    """MJCF of the pendulum with a pole of that mass, and as many joints more, as backlash has one."""
+    """MJCF of the pendulum with a pole of that mass, and as many joints
+    more, as backlash has one."""
     spec = mujoco.MjSpec.from_file(str(model_path("InvertedPendulum-v4")))
     [geom] = spec.body("pole").geoms
     geom.mass = mass
