@@ -23,7 +23,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from envs import EnvError
-from training import claims
+from training import claims_page
 from training.experiments import EXPERIMENTS, version
 from training.results import JUDGED, ROUNDS, finished, merge, rows_of, write
 from training.run_folder import RunError
@@ -190,7 +190,7 @@ def main(argv=None):
             failed = run_all(todo, args.jobs, time.monotonic() + 60 * args.minutes, keep)
             waiting = [job for job in todo if not finished(tables[0], job, now)]
             print(f"{len(jobs) - len(waiting)} of {len(jobs)} runs are in {tables[0]}")
-        claims.report(args.results)
+        claims_page.report(args.results)
         return 1 if failed or waiting else 0
     except (EnvError, RunError, OSError, KeyError, csv.Error) as error:
         print(f"reproduce.py: {error}", file=sys.stderr)

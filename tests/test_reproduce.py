@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 import reproduce
-from training import claims
+from diagnosis.common.atomic_files import write_table
+from training import claims, claims_page
 from training.experiments import EXPERIMENTS, Arm, version
 from training.results import KEY, PROGRESS, finished, merge, read, rows_of, write
 from training.settings import Settings
@@ -35,7 +36,7 @@ def fill(job, steps, value=100.0):
         }
         for k in range(steps + 1)
     ]
-    claims.write_table(job.folder / "progress.csv", PROGRESS, rows)
+    write_table(job.folder / "progress.csv", PROGRESS, rows)
     best = {"grounding_step": steps, "episodes": 4, "real_return_deterministic": value, "se": 1.0}
     (job.folder / "best.json").write_text(json.dumps(best))
     (job.folder / "lines.json").write_text('{"trained on real": 200.0}')
@@ -218,5 +219,5 @@ def test_the_documents_tables_are_the_tables_of_the_csvs():
     kept = read(ROOT / "results" / "claims.csv")
     assert [{k: str(v) for k, v in r.items()} for r in made] == kept
     text = claims.DOCS.read_text()
-    assert claims.filled(text, rounds, judged, transformers, made) == text
+    assert claims_page.filled(text, rounds, judged, transformers, made) == text
     assert "<!-- claims -->" in text and "<!-- rounds -->" in text
