@@ -1,9 +1,9 @@
 """Run the paper's experiments again, and say of every claim whether it holds.
 
-    python reproduce.py                                   # all of it, ten seeds: about sixty processor hours
+    python reproduce.py                                   # all: ten seeds, sixty processor hours
     python reproduce.py --experiments hopper --seeds 0 1 2 --jobs 8 --grounding-steps 3
     python reproduce.py --arms rgat gat --minutes 30      # stops in time; called again it goes on
-    python reproduce.py --claims                          # figures and results/claims.csv from the rows that are there
+    python reproduce.py --claims                          # figures and claims.csv from its rows
     python reproduce.py --merge other/results             # rows that another machine made
 
 Runs are train.py's and lie in runs/VERSION/. results/rounds.csv has a row per grounding step,

@@ -219,7 +219,8 @@ def walking(rows, enough=3000):
     for algo, seeds in curves(rows)["Hopper-v4", "deep", "default"].items():
         rounds = [value for returns in seeds.values() for value in returns[1:]]
         print(
-            f"Hopper-v4 {algo}: above {enough} after {sum(value > enough for value in rounds)} of {len(rounds)} rounds"
+            f"Hopper-v4 {algo}: above {enough} after {sum(value > enough for value in rounds)} of "
+            f"{len(rounds)} rounds"
         )
 
 
@@ -229,7 +230,8 @@ def trpo_table(rows):
     for row in rows:
         groups[row["env"], row["implementation"]].append(row)
     print(
-        "\n| environment | implementation | steps | deterministic, median (each) | stochastic, median | CPU seconds |\n|---|---|---|---|---|---|"
+        "\n| environment | implementation | steps | deterministic, median (each) | stochastic, "
+        "median | CPU seconds |\n|---|---|---|---|---|---|"
     )
     for (env, implementation), mine in sorted(groups.items()):
         returns, noisy, seconds = (
@@ -238,7 +240,8 @@ def trpo_table(rows):
         )
         every = ", ".join(f"{v:.0f}" for v in returns)
         print(
-            f"| {env} | {implementation} | {int(mine[0]['steps']):,} | {np.median(returns):.0f} ({every}) | {np.median(noisy):.0f} | {np.median(seconds):.0f} |"
+            f"| {env} | {implementation} | {int(mine[0]['steps']):,} | {np.median(returns):.0f} "
+            f"({every}) | {np.median(noisy):.0f} | {np.median(seconds):.0f} |"
         )
 
 
@@ -246,7 +249,8 @@ def settings_table(rows):
     """Markdown: what a frozen policy returns in the grounded simulator under each variant, and the
     one-step error; seed by seed."""
     print(
-        "\n| method | units of R_AT | f_ψ | γ_AT | max KL | std | error of f_ψ | one-step error | return, stochastic | deterministic |"
+        "\n| method | units of R_AT | f_ψ | γ_AT | max KL | std | error of f_ψ | one-step error | "
+        "return, stochastic | deterministic |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     variants = defaultdict(list)

@@ -150,11 +150,23 @@ def main(argv=None):
             rates, memory = own.apply(measure, (env_id, num_envs, args))
         a, b, stock, batched = np.median(rates, axis=0)
         ratio = lambda i, j: round(float(np.median(rates[:, i] / rates[:, j])), 3)
-        rows.append({
-            "env": env_id, "num_envs": num_envs, "threads": args.threads or os.cpu_count(), "rounds": args.rounds, "clock": args.clock, "load_before": round(load, 1),
-            "physics_steps_per_s": round(a), "trpo_steps_per_s": round(b), "sb3_one_env_steps_per_s": round(stock), "sb3_batched_steps_per_s": round(batched),
-            "trpo_to_physics": ratio(1, 0), "trpo_to_sb3_one_env": ratio(1, 2), "trpo_to_sb3_batched": ratio(1, 3), "peak_mib_beyond_torch": round(memory),
-        })  # fmt: skip
+        row = {
+            "env": env_id,
+            "num_envs": num_envs,
+            "threads": args.threads or os.cpu_count(),
+            "rounds": args.rounds,
+            "clock": args.clock,
+            "load_before": round(load, 1),
+            "physics_steps_per_s": round(a),
+            "trpo_steps_per_s": round(b),
+            "sb3_one_env_steps_per_s": round(stock),
+            "sb3_batched_steps_per_s": round(batched),
+            "trpo_to_physics": ratio(1, 0),
+            "trpo_to_sb3_one_env": ratio(1, 2),
+            "trpo_to_sb3_batched": ratio(1, 3),
+            "peak_mib_beyond_torch": round(memory),
+        }
+        rows.append(row)
         print(
             f"{env_id}, {num_envs} environments: "
             + ", ".join(f"{k} {v}" for k, v in rows[-1].items() if k not in ("env", "num_envs")),

@@ -55,17 +55,15 @@ def measure(seed, name):
                 grounding = METHODS[algo](sim, settings)
                 grounding.fit(tau_real, seed)
                 grounding.update(learner.policy, s.at_steps, seed)
-                a_hat, a = (
-                    transformed(sim, grounding.transformer, held_out[pick]),
-                    held_out.a[pick, 0],
-                )
+                a_hat = transformed(sim, grounding.transformer, held_out[pick])
+                a, error = held_out.a[pick, 0], one_step_error(sim, grounding.transformer, held_out)
                 key = {"seed": seed, "world": world, "forward_model": model, "algo": algo}
                 rows.append(
                     {
                         **key,
                         "rms_from_identity": f"{np.sqrt(np.mean((a_hat - a) ** 2)):.5f}",
                         "slope": f"{np.polyfit(a, a_hat, 1)[0]:.5f}",
-                        "one_step_error": f"{one_step_error(sim, grounding.transformer, held_out)[0]:.5f}",
+                        "one_step_error": f"{error[0]:.5f}",
                         "version": version(),
                         "commit": name,
                     }

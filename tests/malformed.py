@@ -29,10 +29,12 @@ ARM = """
   <worldbody>
     <body name="upper">
       <joint name="shoulder" axis="0 1 0" damping="0.05"/>
-      <geom name="upper_rod" type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1" contype="0" conaffinity="0"/>
+      <geom name="upper_rod" type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"
+      contype="0" conaffinity="0"/>
       <body name="lower" pos="0 0 -0.3">
         <joint name="elbow" axis="0 1 0" damping="0.05" limited="true" range="-2.9 2.9"/>
-        <geom name="lower_rod" type="capsule" fromto="0 0 0 0 0 -0.25" size="0.015" mass="0.5" contype="0" conaffinity="0"/>
+        <geom name="lower_rod" type="capsule" fromto="0 0 0 0 0 -0.25" size="0.015" mass="0.5"
+        contype="0" conaffinity="0"/>
       </body>
     </body>
   </worldbody>

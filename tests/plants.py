@@ -20,8 +20,10 @@ ARM = """
         <joint name="swing" type="hinge" axis="0 1 0" damping="0.05" armature="0.01" ref="{ref}"/>
         <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="0.7123456789"/>
         <body name="fore" pos=".3 0 .01">
-          <joint name="elbow" type="hinge" axis="0 1 0" damping="0.03 0.01" armature="0.005" stiffness="0.4" springref="{springref}"/>
-          <geom name="tip" type="capsule" fromto="0 0 0 .25 0 0" size=".025" mass="0.4" contype="1" conaffinity="1" friction="0.7"/>
+          <joint name="elbow" type="hinge" axis="0 1 0" damping="0.03 0.01" armature="0.005"
+          stiffness="0.4" springref="{springref}"/>
+          <geom name="tip" type="capsule" fromto="0 0 0 .25 0 0" size=".025" mass="0.4" contype="1"
+          conaffinity="1" friction="0.7"/>
         </body>
       </body>
     </body>
@@ -29,7 +31,8 @@ ARM = """
   <actuator>{actuators}</actuator>
   <sensor><jointpos name="angle" joint="elbow"/><gyro name="spin" site="s"/></sensor>
 </mujoco>""".replace('<geom name="tip"', '<site name="s" pos=".1 0 0"/><geom name="tip"')
-MOTORS = '<motor name="push" joint="lift" gear="20"/><motor joint="swing" gear="2"/><motor name="bend" joint="elbow" gear="0.5" forcerange="-4 4"/>'
+MOTORS = """<motor name="push" joint="lift" gear="20"/><motor joint="swing" gear="2"/>
+<motor name="bend" joint="elbow" gear="0.5" forcerange="-4 4"/>"""
 SERVOS = (
     '<velocity name="push" joint="lift" kv="60"/><position joint="swing" kp="30" kv="1.5"/>'
     '<position name="bend" joint="elbow" kp="12" kv="0.4" forcerange="-3 3"/>'
@@ -166,16 +169,19 @@ def simulate(world, settings, recording, rows=T, **options):
 
 PENDULUM = """
 <mujoco><option timestep="0.001" integrator="{}"/><worldbody><body><joint name="j" axis="0 1 0"/>
-<inertial pos="0 0 -.1" mass=".5" diaginertia=".02 .02 .02"/></body></worldbody><actuator><motor name="m" joint="j"/></actuator></mujoco>"""
+<inertial pos="0 0 -.1" mass=".5" diaginertia=".02 .02 .02"/></body></worldbody><actuator>
+<motor name="m" joint="j"/></actuator></mujoco>"""
 
 
 def pendulum(integrator="implicitfast"):
     return World(mujoco.MjSpec.from_string(PENDULUM.format(integrator)))
 
 
-DROP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="5 5 .1" solref="-4000 {damping}"/>
+DROP = """<mujoco><option timestep="0.002"/><worldbody>
+  <geom name="floor" type="plane" size="5 5 .1" solref="-4000 {damping}"/>
   <body name="block" pos="0 0 .05"><joint name="z" type="slide" axis="0 0 1" damping="0.3"/>
-  <geom name="block" type="box" size=".08 .08 .05" mass="1" solref="-4000 {damping}"/></body></worldbody></mujoco>"""
+  <geom name="block" type="box" size=".08 .08 .05" mass="1" solref="-4000 {damping}"/></body>
+  </worldbody></mujoco>"""
 
 
 def dropped(seed, damping):
@@ -201,8 +207,10 @@ def dropped(seed, damping):
     )
 
 
-DRIVEN_PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="arm"><joint name="pivot" axis="0 1 0" damping="{damping}"/>
-  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="{mass}" contype="0" conaffinity="0"/></body></worldbody>
+DRIVEN_PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="arm">
+  <joint name="pivot" axis="0 1 0" damping="{damping}"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="{mass}" contype="0" conaffinity="0"/>
+  </body></worldbody>
   <actuator><motor name="drive" joint="pivot"/></actuator></mujoco>"""
 
 NOISE = 5e-4

@@ -293,7 +293,8 @@ def test_the_callers_model_stays_as_it_was():
 
 def test_a_servo_of_another_gain_still_goes_where_it_is_told():
     model = mujoco.MjModel.from_xml_string("""
-      <mujoco><option gravity="0 0 0"/><worldbody><body><joint name="hinge" damping="1"/><geom size=".1"/></body></worldbody>
+      <mujoco><option gravity="0 0 0"/><worldbody><body><joint name="hinge" damping="1"/>
+      <geom size=".1"/></body></worldbody>
       <actuator><position joint="hinge" kp="20"/></actuator></mujoco>""")
     strong = perturb(model, parse_perturbation("hinge:gain*3"))
     assert strong.actuator_gainprm[0, 0] == 60

@@ -289,7 +289,8 @@ def test_policy_loads_with_torch_alone(tmp_path):
     torch.save(GaussianPolicy(5, 2).checkpoint(), tmp_path / "policy.pt")
     program = (
         "import sys\n"
-        "for name in ('mujoco', 'gymnasium', 'matplotlib', 'tqdm', 'PIL'): sys.modules[name] = None\n"
+        "for name in ('mujoco', 'gymnasium', 'matplotlib', 'tqdm', 'PIL'): sys.modules[name] = "
+        "None\n"
         "import torch\n"
         "from models import GaussianPolicy\n"
         f"policy = GaussianPolicy.load({str(tmp_path / 'policy.pt')!r})\n"

@@ -218,6 +218,6 @@ def test_the_documents_tables_are_the_tables_of_the_csvs():
     made = claims.table(rounds, judged, transformers)
     kept = read(ROOT / "results" / "claims.csv")
     assert [{k: str(v) for k, v in r.items()} for r in made] == kept
-    text = claims.DOCS.read_text()
+    text = claims_page.DOCS.read_text()
     assert claims_page.filled(text, rounds, judged, transformers, made) == text
     assert "<!-- claims -->" in text and "<!-- rounds -->" in text

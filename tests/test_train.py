@@ -27,12 +27,13 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 
 ENV = "InvertedPendulum-v4"
 TINY = (
-    "--pretrain-steps 4000 --grounding-steps 2 --at-steps 1024 --policy-steps 4096 --real-trajectories 4 "
-    "--eval-episodes 2 --num-envs 4 --threads 1 --seed 3"
+    "--pretrain-steps 4000 --grounding-steps 2 --at-steps 1024 --policy-steps 4096 "
+    "--real-trajectories 4 --eval-episodes 2 --num-envs 4 --threads 1 --seed 3"
 ).split()
 PROGRESS = (
-    "grounding_step,real_transitions,real_transitions_judging,sim_steps,real_return_deterministic,real_return_deterministic_se,"
-    "real_return_stochastic,forward_model_error,at_one_step_error,identity_one_step_error,delta_action_rms,at_std,kl,"
+    "grounding_step,real_transitions,real_transitions_judging,sim_steps,"
+    "real_return_deterministic,real_return_deterministic_se,real_return_stochastic,"
+    "forward_model_error,at_one_step_error,identity_one_step_error,delta_action_rms,at_std,kl,"
     "rolled_back_to,seconds"
 )
 
@@ -537,9 +538,12 @@ def test_a_disk_that_fills_up_leaves_whole_steps(write, tmp_path, capfd, finishe
 
 
 SETTINGS = {
-    "config with a word for a number": ("num_envs", "many"), "config with half a seed": ("seed", 0.5), "config with another algo": ("algo", "sac"),
-    "config with another policy": ("policy", "wide"), "config with a number for a change": ("real", 5),
-}  # fmt: skip
+    "config with a word for a number": ("num_envs", "many"),
+    "config with half a seed": ("seed", 0.5),
+    "config with another algo": ("algo", "sac"),
+    "config with another policy": ("policy", "wide"),
+    "config with a number for a change": ("real", 5),
+}
 LINES = {
     "lines in a list": "[1]",
     "lines of something else": '{"a": 1}',
@@ -594,8 +598,10 @@ def break_run(folder, how):
 
 
 BROKEN = (
-    "no run,config of something else,config with foreign settings,config cut short,table cut short,progress without numbers,checkpoint that is a tensor,"
-    "checkpoint missing,checkpoint cut short,checkpoint of something else,checkpoint of another robot,checkpoint that is a list,"
+    "no run,config of something else,config with foreign settings,config cut short,"
+    "table cut short,progress without numbers,checkpoint that is a tensor,"
+    "checkpoint missing,checkpoint cut short,checkpoint of something else,"
+    "checkpoint of another robot,checkpoint that is a list,"
     "real data missing,real data broken,policy broken,policy missing"
 ).split(",") + [*SETTINGS, *LINES]
 
@@ -649,7 +655,8 @@ def test_help_has_a_line_for_each_setting(capsys):
         train.main(["--help"])
     text = capsys.readouterr().out
     assert leave.value.code == 0
-    for name in "env algo seed real policy pretrain-steps grounding-steps real-trajectories at-steps policy-steps eval-episodes num-envs out resume replay".split():
+    steps = "pretrain-steps grounding-steps at-steps policy-steps real-trajectories eval-episodes"
+    for name in f"env algo seed real policy {steps} num-envs out resume replay".split():
         assert f"--{name} " in text
 
 

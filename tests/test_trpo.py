@@ -181,11 +181,10 @@ def advantages(kind, obs, action, g):
     }[kind]
 
 
-KINDS = list(
-    "random,zero,equal,nearly equal,huge,overflowing,tiny,one,correlated,anticorrelated,infinite,nan".split(
-        ","
-    )
-)
+KINDS = (
+    "random,zero,equal,nearly equal,huge,overflowing,tiny,one,correlated,anticorrelated,"
+    "infinite,nan"
+).split(",")
 RESTORED = ("no gradient", "no curvature", "exhausted")
 
 

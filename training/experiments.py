@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 
 from training.run_folder import versions
 from training.settings import Settings
@@ -44,7 +45,8 @@ def version():
 
 def methods(experiment, **shared):
     """Every method on one world."""
-    arms = [Arm(experiment, algo, Settings(algo=algo, **shared)) for algo in ("rgat", "gat", "sim", "solved", "real")]  # fmt: skip
+    plain = "rgat", "gat", "sim", "solved", "real"
+    arms = [Arm(experiment, algo, Settings(algo=algo, **shared)) for algo in plain]
     arms += [
         Arm(experiment, f"ane {width:g}", Settings(algo="ane", ane_width=width, **shared))
         for width in WIDTHS
@@ -71,12 +73,22 @@ def amounts(experiment, algos, counts, **shared):
 
 def critical(experiment, **shared):
     """Section IV-D: trust region, entropy and discount of the transformer, end to end."""
+    arms = []
+    for kl, entropy, gamma in product((1e-4, 1e-3, 1e-2), (0.0, 1e-5, 1e-3), (0.0, 0.9, 0.99)):
+        name = f"KL {kl:g}, H {entropy:g}, gamma {gamma:g}"
+        at = {"at_max_kl": kl, "at_entropy": entropy, "at_gamma": gamma}
+        arms.append(Arm(experiment, name, Settings(algo="rgat", **at, **shared)))
+    return arms
+
+
+def capacity(experiment, envs):
+    """What shallow and deep policies reach, trained on real alone."""
+    alone = {"algo": "real", "grounding_steps": 0}
     return [
-        Arm(experiment, f"KL {kl:g}, H {entropy:g}, gamma {gamma:g}", Settings(algo="rgat", at_max_kl=kl, at_entropy=entropy, at_gamma=gamma, **shared))
-        for kl in (1e-4, 1e-3, 1e-2)
-        for entropy in (0.0, 1e-5, 1e-3)
-        for gamma in (0.0, 0.9, 0.99)
-    ]  # fmt: skip
+        Arm(experiment, f"{env}, {policy}", Settings(env=env, policy=policy, **alone))
+        for env in envs
+        for policy in ("shallow", "deep")
+    ]
 
 
 PENDULUM, HOPPER, CHEETAH = "InvertedPendulum-v4", "Hopper-v4", "HalfCheetah-v4"
@@ -88,14 +100,12 @@ EXPERIMENTS = {
     ),
     "hopper": methods("hopper", env=HOPPER, grounding_steps=10),
     "cheetah": methods("cheetah", env=CHEETAH, grounding_steps=20),
-    "cheetah with a gap": methods(
-        "cheetah with a gap", env=CHEETAH, real=GAP, grounding_steps=20
+    "cheetah with a gap": methods("cheetah with a gap", env=CHEETAH, real=GAP, grounding_steps=20),
+    "capacity": capacity("capacity", (HOPPER, CHEETAH)),
+    "data": amounts(
+        *("data", ("rgat", "gat", "solved", "physics"), (1, 5, 10, 25, 50, 100)),
+        env=HOPPER,
+        grounding_steps=3,
     ),
-    "capacity": [
-        Arm("capacity", f"{env}, {policy}", Settings(env=env, algo="real", policy=policy, grounding_steps=0))
-        for env in (HOPPER, CHEETAH)
-        for policy in ("shallow", "deep")
-    ],
-    "data": amounts("data", ("rgat", "gat", "solved", "physics"), (1, 5, 10, 25, 50, 100), env=HOPPER, grounding_steps=3),
     "critical": critical("critical", env=PENDULUM, grounding_steps=3),
-}  # fmt: skip
+}

@@ -27,16 +27,18 @@ from diagnosis.common.atomic_files import write_table, write_whole
 from models import GaussianPolicy, load_checkpoint
 
 PROGRESS = (
-    "grounding_step real_transitions real_transitions_judging sim_steps real_return_deterministic real_return_deterministic_se "
-    "real_return_stochastic forward_model_error at_one_step_error identity_one_step_error delta_action_rms at_std kl rolled_back_to seconds"
+    "grounding_step real_transitions real_transitions_judging sim_steps "
+    "real_return_deterministic real_return_deterministic_se real_return_stochastic "
+    "forward_model_error at_one_step_error identity_one_step_error "
+    "delta_action_rms at_std kl rolled_back_to seconds"
 ).split()
-ALWAYS = [k for k in PROGRESS if k.startswith("real_")] + [
-    "grounding_step",
-    "sim_steps",
-    "seconds",
-]  # numbers in every row
+ALWAYS = [  # numbers in every row
+    *(k for k in PROGRESS if k.startswith("real_")),
+    *("grounding_step", "sim_steps", "seconds"),
+]
 TRAIN = (
-    "grounding_step phase steps return reward kl surrogate_gain step_size line_search entropy explained_variance std"
+    "grounding_step phase steps return reward kl surrogate_gain step_size line_search entropy "
+    "explained_variance std"
 ).split()
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
@@ -106,7 +108,8 @@ class Run:
         try:
             if (run.folder / "config.json").exists():
                 raise RunError(
-                    f"{folder} already holds a run: continue it with --resume {folder}, or choose another --out"
+                    f"{folder} already holds a run: continue it with --resume {folder}, or choose "
+                    "another --out"
                 )
             run.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

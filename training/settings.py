@@ -72,20 +72,23 @@ class Settings:
     )
     algo: str = option(
         "rgat",
-        "how to ground: rgat, gat, ane, oracle, solved (rgat's transformer with a label instead of a reward), "
+        "how to ground: rgat, gat, ane, oracle, solved (rgat's transformer with a label instead of "
+        "a reward), "
         "physics (diagnose.py), and physics+rgat or physics+solved for what has no name; "
         "sim and real train in that world alone",
         choices=ALGOS,
     )
     preset: str = option(
         "tuned",
-        "what fills in the settings left open: tuned, or paper (Algorithm 1 as printed, stable-baselines' TRPO)",
+        "what fills in the settings left open: tuned, or paper (Algorithm 1 as printed, "
+        "stable-baselines' TRPO)",
         choices=list(PRESET),
     )
     seed: int = option(0, "seed of everything random")
     real: str = option(
         None,
-        "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the paper's)",
+        "how the real world differs, e.g. torso:mass*1.27,foot_joint:damping=2 (default: the "
+        "paper's)",
     )
     real_data: str = option(
         "",
@@ -102,12 +105,14 @@ class Settings:
     )
     reference_steps: int = option(
         None,
-        "steps on real, from scratch, of the policy that is the reference line (default: by task, or --pretrain-steps if given)",
+        "steps on real, from scratch, of the policy that is the reference line (default: by task, "
+        "or --pretrain-steps if given)",
     )
     grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
     real_trajectories: int = option(
         None,
-        "real episodes recorded per grounding step (default: 50; physics: 1, or more until they hold 200 steps)",
+        "real episodes recorded per grounding step (default: 50; physics: 1, or more until they "
+        "hold 200 steps)",
     )
     at_steps: int = option(
         None, "sim steps per grounding step for the action transformer (default: by task)"
@@ -120,7 +125,8 @@ class Settings:
     )
     roll_back: float = option(
         0.0,
-        "go on from the best policy so far where the return on real falls below this part of the best (0: never)",
+        "go on from the best policy so far where the return on real falls below this part of the "
+        "best (0: never)",
     )
     num_envs: int = option(32, "simulations stepped at once")
     at_max_kl: float = option(
@@ -132,22 +138,26 @@ class Settings:
     )
     at_std: float = option(
         None,
-        "rgat: its initial standard deviation, as a part of the action range (default: by preset and task)",
+        "rgat: its initial standard deviation, as a part of the action range (default: by preset "
+        "and task)",
     )
     at_norm: str = option(
         None,
-        "rgat, oracle, solved: R_AT in units of each dimension's change in a real step, or raw (default: by preset)",
+        "rgat, oracle, solved: R_AT in units of each dimension's change in a real step, or raw "
+        "(default: by preset)",
         choices=["step", "raw"],
     )
     forward_model: str = option(
         None,
-        "rgat, gat, solved: f_psi corrects the sim's own prediction (residual), or (plain) is the paper's network of "
+        "rgat, gat, solved: f_psi corrects the sim's own prediction (residual), or (plain) is the "
+        "paper's network of "
         "(s, a) alone (default: by preset)",
         choices=["residual", "plain"],
     )
     threads: int = option(
         0,
-        "cores for the simulations (default: all); they change no number: seeds side by side do best with 1 each",
+        "cores for the simulations (default: all); they change no number: seeds side by side do "
+        "best with 1 each",
     )
     pretrained: str = option(
         "", "folder that keeps policies trained from scratch, for other runs to share"
@@ -276,10 +286,11 @@ def load_task(path):
     return name
 
 
-COUNTS = {
-    "seed": 0, "pretrain_steps": 0, "reference_steps": 0, "grounding_steps": 0, "real_trajectories": 1, "at_steps": 1, "policy_steps": 0,
-    "eval_episodes": 1, "num_envs": 1, "threads": 0,
-}  # fmt: skip
+COUNTS = {  # the least of each
+    **dict.fromkeys(("seed", "pretrain_steps", "reference_steps", "grounding_steps"), 0),
+    **dict.fromkeys(("real_trajectories", "at_steps", "eval_episodes", "num_envs"), 1),
+    **dict.fromkeys(("policy_steps", "threads"), 0),
+}
 
 
 def settings_of(folder, saved):
@@ -306,7 +317,10 @@ def kind_of(setting):
     return {"int": int, "float": float, "str": str}[getattr(setting.type, "__name__", setting.type)]
 
 
-PURPOSES = ("networks", "pretrain", "collect", "model", "transformer", "held out", "policy", "evaluate", "best")  # fmt: skip
+PURPOSES = (  # their order is part of every seed
+    *("networks", "pretrain", "collect", "model", "transformer"),
+    *("held out", "policy", "evaluate", "best"),
+)
 
 
 def seed_for(seed, step, purpose):

@@ -120,7 +120,8 @@ def _readings(recording, model, states, half):
                 turned = states[0].copy()
                 turned[:, q[j]] += np.deg2rad(degrees)
                 yield Reading(
-                    f"column 'qpos:{names[j]}' seems to count from another zero than the model; add {degrees} degrees "
+                    f"column 'qpos:{names[j]}' seems to count from another zero than the model; "
+                    f"add {degrees} degrees "
                     f"({np.deg2rad(degrees):.4f}), or set the joint's ref",
                     [v[j]],
                     SWAP_GAIN,
@@ -161,7 +162,8 @@ def _readings(recording, model, states, half):
         for j in single:
             if driven[a].tolist() == [v[j]]:
                 yield Reading(
-                    f"columns 'qpos:{names[j]}' and '{column}' do not fit the signs of the others; turn both round, or "
+                    f"columns 'qpos:{names[j]}' and '{column}' do not fit the signs of the others; "
+                    "turn both round, or "
                     "that joint's axis in the model",
                     driven[a],
                     SWAP_GAIN,
@@ -197,7 +199,8 @@ def _readings(recording, model, states, half):
                 1:
             ]
             yield Reading(
-                f"column 'qpos:{names[j]}:{first - q[j]}' and the next three seem to be x y z w; order is w x y z",
+                f"column 'qpos:{names[j]}:{first - q[j]}' and the next three seem to be x y z w; "
+                "order is w x y z",
                 list(range(v[j], v[j] + (6 if j in free else 3))),
                 SWAP_GAIN,
                 turned,

@@ -357,7 +357,8 @@ def test_a_force_range_that_is_not_symmetric_keeps_its_shape():
 
 
 def test_effects_where_a_motor_turns_a_free_body():
-    thrust = '<actuator><motor name="up" joint="f" gear="0 0 1 0 0 0"/><position name="p" joint="f" gear="0 0 1 0 0 0" kp="3"/></actuator></mujoco>'
+    thrust = """<actuator><motor name="up" joint="f" gear="0 0 1 0 0 0"/>
+        <position name="p" joint="f" gear="0 0 1 0 0 0" kp="3"/></actuator></mujoco>"""
     world = World(mujoco.MjSpec.from_string(BOX.format(0.002, 0.5).replace("</mujoco>", thrust)))
     own = [c for c in world.candidates if c.place.kind == "actuator"]
     assert all(np.isfinite([p.low, p.step]).all() and p.step for c in own for p in c.parameters)
@@ -428,7 +429,8 @@ def test_a_corrected_model_may_lack_another_force():
 )
 def test_the_unit_of_a_motors_force(joint, transmission, unit):
     world = World(
-        mujoco.MjSpec.from_string(f'''<mujoco><worldbody><body><joint name="j" type="{joint}"/><geom size=".1"/></body></worldbody>
+        mujoco.MjSpec.from_string(f'''<mujoco><worldbody><body><joint name="j" type="{joint}"/>
+            <geom size=".1"/></body></worldbody>
       <actuator><motor name="m" {transmission}="j" ctrlrange="-1 1"/></actuator></mujoco>''')
     )
     assert world.candidate("saturation", "m").parameters[0].unit == unit

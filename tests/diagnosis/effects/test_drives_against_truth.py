@@ -29,13 +29,30 @@ SERVOS = tuple(replace(a, kind="position", kp=12.0, kv=0.3) for a in MOTORS)
 def robot(actuators):
     """Two links that swing under gravity about parallel axes, with rotors and damping."""
     first = Link(
-        "link0", -1, "hinge", (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), 0.3, 0.03,
-        0.8, (0.0, 0.0, 0.15), (0.01, 0.01, 0.002), armature=0.02, damping=0.1,
-    )  # fmt: skip
+        "link0",
+        -1,
+        "hinge",
+        (0.0, 1.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0, 0.0),
+        0.3,
+        0.03,
+        0.8,
+        (0.0, 0.0, 0.15),
+        (0.01, 0.01, 0.002),
+        armature=0.02,
+        damping=0.1,
+    )
     second = replace(
-        first, name="link1", parent=0, position=(0.0, 0.0, 0.3), quaternion=(1.0, 0.0, 0.0, 0.0),
-        mass=0.4, center_of_mass=(0.0, 0.0, 0.12), inertia=(0.004, 0.004, 0.001),
-    )  # fmt: skip
+        first,
+        name="link1",
+        parent=0,
+        position=(0.0, 0.0, 0.3),
+        quaternion=(1.0, 0.0, 0.0, 0.0),
+        mass=0.4,
+        center_of_mass=(0.0, 0.0, 0.12),
+        inertia=(0.004, 0.004, 0.001),
+    )
     return Robot((first, second), actuators, 0.001, 1e-4, "implicitfast")
 
 
@@ -57,10 +74,16 @@ def true_motion(machine, laws, recording, start):
 
 CASES = {
     "load_friction": (
-        MOTORS, L.LoadFriction(1, driving=0.4, driven=0.25), "joint1", (0.4, 0.25, 0.0),
+        MOTORS,
+        L.LoadFriction(1, driving=0.4, driven=0.25),
+        "joint1",
+        (0.4, 0.25, 0.0),
     ),
     "load_friction of a servo": (
-        SERVOS, L.LoadFriction(0, driving=0.3, driven=0.3), "joint0", (0.3, 0.3, 0.0),
+        SERVOS,
+        L.LoadFriction(0, driving=0.3, driven=0.3),
+        "joint0",
+        (0.3, 0.3, 0.0),
     ),
     "friction_map": (
         MOTORS,
@@ -68,9 +91,17 @@ CASES = {
         "joint1",
         (0.1, 0.8, 4.0, 0.5),
     ),
-    "presliding": (MOTORS, L.Presliding(1, frictionloss=0.12, stiffness=2.0), "joint1", (0.12, 2.0)),
+    "presliding": (
+        MOTORS,
+        L.Presliding(1, frictionloss=0.12, stiffness=2.0),
+        "joint1",
+        (0.12, 2.0),
+    ),
     "joint_elasticity": (
-        MOTORS, L.JointElasticity(1, stiffness=1.5, damping=0.02), "joint1", (1.5, 0.02),
+        MOTORS,
+        L.JointElasticity(1, stiffness=1.5, damping=0.02),
+        "joint1",
+        (1.5, 0.02),
     ),
     "rate_limit": (SERVOS, L.RateLimit(1, actuator=1, rate=3.0), "drive1", (3.0,)),
     "torque_speed": (MOTORS, L.TorqueSpeed(1, slope=0.15, stall=0.5), "drive1", (0.15, 0.5)),
@@ -78,12 +109,18 @@ CASES = {
     "dead_zone": (SERVOS, L.DeadZone(1, actuator=1, width=0.3, servo=True), "drive1", (0.3,)),
     "lag": (MOTORS, L.Lag(1, actuator=1, seconds=0.03), "drive1", (0.03,)),
     "coupled_friction": (
-        MOTORS, L.CoupledFriction(1, other=0, level=0.15, creep=1e-3), "joint0+joint1", (0.15,),
+        MOTORS,
+        L.CoupledFriction(1, other=0, level=0.15, creep=1e-3),
+        "joint0+joint1",
+        (0.15,),
     ),
     "coupled_inertia": (
-        MOTORS, L.CoupledInertia(1, other=0, inertia=0.03), "joint0+joint1", (0.03,),
+        MOTORS,
+        L.CoupledInertia(1, other=0, inertia=0.03),
+        "joint0+joint1",
+        (0.03,),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -406,7 +406,8 @@ def test_stribeck_friction_has_fallen_at_the_speeds_that_are_reached():
 def test_small_steps_are_forces_of_one_size_whatever_the_motion(reach, speed):
     """k·x³ and d·v² at the farthest and fastest row, against the steps of a motion of size one."""
     world = World(
-        mujoco.MjSpec.from_string("""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body>
+        mujoco.MjSpec.from_string("""<mujoco><worldbody><body><joint name="x" type="slide"/>
+            <geom size=".1"/></body>
                                             </worldbody></mujoco>""")
     )
     there_and_back = reach * np.array([0.0, 1.0, 0.0, -1.0] * 50)
@@ -421,7 +422,8 @@ def test_small_steps_are_forces_of_one_size_whatever_the_motion(reach, speed):
         )
 
 
-ROD = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="x" axis="0 1 0" range="-1.2 1.5"/><geom size=".1" pos="0 0 .3"/></body>
+ROD = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="x" axis="0 1 0"
+  range="-1.2 1.5"/><geom size=".1" pos="0 0 .3"/></body>
   </worldbody><actuator><motor name="m" joint="x"/></actuator></mujoco>"""
 
 
@@ -508,10 +510,12 @@ def test_meshes_are_found_from_the_report(tmp_path):
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     )
     (tmp_path / "model" / "rest.xml").write_text(
-        '<mujoco><worldbody><body name="b"><joint/><geom type="mesh" mesh="tetra"/></body></worldbody></mujoco>'
+        '<mujoco><worldbody><body name="b"><joint/>'
+        '<geom type="mesh" mesh="tetra"/></body></worldbody></mujoco>'
     )
     (tmp_path / "model" / "sim.xml").write_text(
-        '<mujoco><compiler meshdir="parts"/><asset><mesh file="tetra.obj"/></asset><include file="rest.xml"/></mujoco>'
+        '<mujoco><compiler meshdir="parts"/><asset><mesh file="tetra.obj"/></asset>'
+        '<include file="rest.xml"/></mujoco>'
     )
     world = World.load(tmp_path / "model" / "sim.xml")
     (tmp_path / "report" / "corrected.xml").write_text(

@@ -13,10 +13,14 @@ from diagnosis.recordings.recording import Recording
 from diagnosis.selection import sensor_faults
 from diagnosis.simulation.simulator import World
 
-ARM = """<mujoco><option timestep="0.002"/><worldbody><body><joint name="a" axis="0 1 0" damping="{damping}"/>
-  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="0.5" contype="0" conaffinity="0"/><site name="tip" pos="0 0 -.4"/></body></worldbody>
-  <actuator><motor name="m" joint="a"/></actuator><sensor><jointpos name="angle" joint="a"/><gyro name="spin" site="tip"/>
-  <accelerometer name="felt" site="tip"/><framepos name="where" objtype="site" objname="tip"/><actuatorfrc name="force" actuator="m"/></sensor></mujoco>"""
+ARM = """<mujoco><option timestep="0.002"/><worldbody><body><joint name="a" axis="0 1 0"
+  damping="{damping}"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="0.5" contype="0" conaffinity="0"/>
+  <site name="tip" pos="0 0 -.4"/></body></worldbody>
+  <actuator><motor name="m" joint="a"/></actuator><sensor><jointpos name="angle" joint="a"/>
+  <gyro name="spin" site="tip"/>
+  <accelerometer name="felt" site="tip"/><framepos name="where" objtype="site" objname="tip"/>
+  <actuatorfrc name="force" actuator="m"/></sensor></mujoco>"""
 NOISE = {"angle": 0.001, "spin": 0.01, "felt": 0.05, "where": 0.001, "force": 0.002}
 
 
@@ -124,8 +128,10 @@ def test_a_fault_is_named_with_its_size(effect, name, value, fault):
 
 
 def test_the_two_quaternions_of_a_rotation_are_one():
-    xml = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body><joint name="a" axis="0 1 0"/><geom size=".1" mass="1"/>
-      <site name="s"/></body></worldbody><sensor><framequat name="q" objtype="site" objname="s"/></sensor></mujoco>"""
+    xml = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body>
+        <joint name="a" axis="0 1 0"/><geom size=".1" mass="1"/>
+      <site name="s"/></body></worldbody><sensor><framequat name="q" objtype="site" objname="s"/>
+      </sensor></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
     data, qpos, quat = mujoco.MjData(model), np.empty((400, 1)), np.empty((400, 4))
     data.qvel[:] = 6.0

@@ -76,7 +76,9 @@ def test_a_window_goes_on_where_the_run_was(case, effect, values):
 
 
 def test_filtered_and_integrating_actuators_go_on_too():
-    actuators = '<general name="push" joint="lift" dyntype="filter" dynprm="0.03" gainprm="20"/><intvelocity name="swing" joint="swing" kp="3"/>'
+    actuators = """
+        <general name="push" joint="lift" dyntype="filter" dynprm="0.03" gainprm="20"/>
+        <intvelocity name="swing" joint="swing" kp="3"/>"""
     xml = ARM.format(
         actuators=actuators, integrator="Euler", angle="radian", ref=0.35, springref=-0.2
     )
@@ -103,8 +105,10 @@ def test_filtered_and_integrating_actuators_go_on_too():
 
 def test_muscles_go_on_too():
     world = World(
-        mujoco.MjSpec.from_string("""<mujoco><option timestep="0.002"/><worldbody><body><joint name="j" axis="0 1 0" damping="1"/>
-        <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02"/></body></worldbody><actuator><muscle name="m" joint="j" force="50"
+        mujoco.MjSpec.from_string("""<mujoco><option timestep="0.002"/><worldbody><body>
+            <joint name="j" axis="0 1 0" damping="1"/>
+        <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02"/></body></worldbody><actuator>
+        <muscle name="m" joint="j" force="50"
         lengthrange="-1 1" ctrlrange="0 1"/></actuator></mujoco>""")
     )
     recording = commanded(0.01 * np.arange(40), np.repeat([[0.1], [1.4], [0.0], [0.6]], 10, axis=0))
@@ -119,7 +123,8 @@ def test_muscles_go_on_too():
     np.testing.assert_allclose(later[0], q[12:], rtol=0, atol=1e-9)
 
 
-BALLS = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint name="neck" type="ball" {}/>
+BALLS = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
+  <joint name="neck" type="ball" {}/>
 <geom type="capsule" fromto="0 0 0 .1 0 -.4" size=".02" mass="1"/></body></worldbody></mujoco>"""
 
 
@@ -153,8 +158,10 @@ def test_effects_of_a_ball_joint(effect, value, attribute):
 def test_rows_between_time_steps():
     """Irregular rows that no time step meets, against the closed form of an oscillator pushed at
     those rows."""
-    xml = """<mujoco><option timestep="0.003" gravity="0 0 0" integrator="RK4"/><worldbody><body><joint name="x" type="slide" axis="1 0 0" stiffness="50"/>
-             <geom size=".1" mass="2"/></body></worldbody><actuator><motor name="m" joint="x"/></actuator></mujoco>"""
+    xml = """<mujoco><option timestep="0.003" gravity="0 0 0" integrator="RK4"/><worldbody><body>
+        <joint name="x" type="slide" axis="1 0 0" stiffness="50"/>
+             <geom size=".1" mass="2"/></body></worldbody><actuator><motor name="m" joint="x"/>
+             </actuator></mujoco>"""
     world, rng = World(mujoco.MjSpec.from_string(xml)), np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.002, 0.02, 60))
     force, q, v, w = rng.uniform(-5, 5, 60), 0.1, -0.3, 5.0
@@ -350,9 +357,12 @@ def test_a_batch_is_its_members(case):
 
 def test_a_block_that_only_slides_and_hops():
     """Such a body is `simple` to MuJoCo, and its contacts would be softer if it were not."""
-    xml = """<mujoco><option timestep="0.002" cone="elliptic"/><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .05">
-             <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size=".08 .08 .05" mass="1"/>
-             </body></worldbody><actuator><motor joint="x"/><motor joint="z"/></actuator></mujoco>"""
+    xml = """<mujoco><option timestep="0.002" cone="elliptic"/><worldbody>
+        <geom type="plane" size="5 5 .1"/><body pos="0 0 .05">
+             <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+             <geom type="box" size=".08 .08 .05" mass="1"/>
+             </body></worldbody><actuator><motor joint="x"/><motor joint="z"/></actuator>
+             </mujoco>"""
     world = World(mujoco.MjSpec.from_string(xml))
     rng = np.random.default_rng(0)
     recording = commanded(np.arange(60) * 0.01, rng.uniform(-20, 10, (60, 2)))
@@ -367,8 +377,10 @@ def test_a_block_that_only_slides_and_hops():
 
 
 CUBE = """
-<mujoco><option timestep="0.001"/><worldbody><geom name="floor" type="plane" size="3 3 .1"/><body name="cube" pos="0 0 .3">
-<freejoint name="free"/><geom name="box" type="box" size=".05 .05 .05" mass=".4"/></body></worldbody></mujoco>"""
+<mujoco><option timestep="0.001"/><worldbody><geom name="floor" type="plane" size="3 3 .1"/>
+<body name="cube" pos="0 0 .3">
+<freejoint name="free"/><geom name="box" type="box" size=".05 .05 .05" mass=".4"/></body>
+</worldbody></mujoco>"""
 
 
 def test_a_tossed_cube(case):

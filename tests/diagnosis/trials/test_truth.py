@@ -20,9 +20,11 @@ ROTOR = 0.05
 def pendulum(**values):
     """A link that hangs upwards from a hinge about y, with a motor."""
     link = Link(
-        "link0", -1, "hinge", (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), 0.6, 0.03,
-        MASS, (0.0, 0.0, LEVER), (ABOUT, ABOUT, 0.005), armature=ROTOR, damping=0.05,
-    )  # fmt: skip
+        *("link0", -1, "hinge", (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), 0.6, 0.03),
+        *(MASS, (0.0, 0.0, LEVER), (ABOUT, ABOUT, 0.005)),
+        armature=ROTOR,
+        damping=0.05,
+    )
     motor = Actuator("drive0", 0, "motor", 1.0, 1.0, 50.0)
     return Robot((replace(link, **values),), (motor,), 0.002, 2e-4, "Euler")
 
@@ -64,19 +66,28 @@ def solve(force, ctrl, start, rows=100, row=0.01, extra=()):
 
 
 LAWS = [
-    (L.Cogging(0, amplitude=0.4, poles=5.0, phase=0.3), lambda t, q, v, u, m: (0.4 * np.sin(5 * q + 0.3), ())),
+    (
+        L.Cogging(0, amplitude=0.4, poles=5.0, phase=0.3),
+        lambda t, q, v, u, m: (0.4 * np.sin(5 * q + 0.3), ()),
+    ),
     (L.QuadraticDamping(0, damping2=0.1), lambda t, q, v, u, m: (-0.1 * v * abs(v), ())),
     (L.CubicSpring(0, stiffness3=2.0), lambda t, q, v, u, m: (-2.0 * q**3, ())),
-    (L.Shaking(0, amplitude=0.5, hertz=2.0, phase=1.0),
-     lambda t, q, v, u, m: (0.5 * np.sin(4 * np.pi * t + 1.0), ())),
+    (
+        L.Shaking(0, amplitude=0.5, hertz=2.0, phase=1.0),
+        lambda t, q, v, u, m: (0.5 * np.sin(4 * np.pi * t + 1.0), ()),
+    ),
     (L.OneWayBearing(0, damping=0.3), lambda t, q, v, u, m: (-0.3 * max(v, 0.0), ())),
-    (L.UnevenMotor(0, share=0.3, waves=2.0, phase=0.0),
-     lambda t, q, v, u, m: (0.3 * np.cos(2 * q) * u, ())),
+    (
+        L.UnevenMotor(0, share=0.3, waves=2.0, phase=0.0),
+        lambda t, q, v, u, m: (0.3 * np.cos(2 * q) * u, ()),
+    ),
     (L.GainFade(0, rate=0.4), lambda t, q, v, u, m: (u * (np.exp(-0.4 * t) - 1), ())),
-    (L.FluidMemory(0, damping=0.3, seconds=0.2),
-     lambda t, q, v, u, m: (-0.3 * m[0], ((v - m[0]) / 0.2,))),
+    (
+        L.FluidMemory(0, damping=0.3, seconds=0.2),
+        lambda t, q, v, u, m: (-0.3 * m[0], ((v - m[0]) / 0.2,)),
+    ),
     (L.Lag(0, actuator=0, seconds=0.05), lambda t, q, v, u, m: (m[0] - u, ((u - m[0]) / 0.05,))),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("law, force", LAWS, ids=lambda x: type(x).__name__)
