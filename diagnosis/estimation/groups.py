@@ -10,8 +10,8 @@ of freedom, as in intervals.py, for one parameter in closed form.
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
+from diagnosis.common.distributions import t_ppf, t_sf
 from diagnosis.estimation.ahead import GROUPS
 
 FEWEST = 4  # groups, below which their spread says nothing
@@ -51,5 +51,5 @@ def fitted(gram, score):
     left = (score - gram * value) / np.sqrt(np.clip(1 - share, 0.05, 1.0))
     error = np.sqrt((left**2).sum()) / total
     freedom = max(1 / (share**2).sum() - 1, 1.0)
-    chance = 2 * stats.t.sf(abs(value) / max(error, 1e-300), freedom)
-    return Line(float(value), float(stats.t.ppf(0.975, freedom) * error), float(chance))
+    chance = 2 * t_sf(abs(value) / max(error, 1e-300), freedom)
+    return Line(float(value), float(t_ppf(0.975, freedom) * error), float(chance))

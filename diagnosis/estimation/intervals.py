@@ -8,7 +8,8 @@ Business and Economic Statistics 36 (2018).
 """
 
 import numpy as np
-from scipy import stats
+
+from diagnosis.common.distributions import t_ppf
 
 SHARED = 0.01  # of a direction that is not seen, the part beyond which a value is not told
 FLAT = 0.2  # of the squares' curvature, the least that the loss's is taken for
@@ -106,7 +107,7 @@ def half_widths(evidence, index):
     bread = root @ np.linalg.inv(curvature) @ root.T
     covariance = bread @ meat @ bread
     freedom = np.maximum(1 / np.maximum((shares**2).sum(0), 1e-9) - 1, 1.0)
-    half = stats.t.ppf(0.975, freedom) * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    half = t_ppf(0.975, freedom) * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     half[unseen] = np.inf
     return half / scale, moves / scale
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
+
 
 @dataclass(frozen=True)
 class Smoothed:
@@ -51,7 +53,7 @@ def smooth(A, c, Q, y, R, start, spread):
         K, Finv, k = gain[t], inverse[t], known[t]
         Kt = K.transpose(0, 2, 1)
         u = ((Finv @ error[t][..., None]) - Kt @ r[..., None])[..., 0]
-        D = np.einsum("bii->bi", Finv) + np.einsum("bij,bjk,bki->bi", Kt, N, K, optimize=True)
+        D = np.einsum("bii->bi", Finv) + np.einsum("bij,bjk,bki->bi", Kt, N, K, optimize=PAIRS)
         measurement[0] += (u**2 * k).sum(0)
         measurement[1] += (D * k).sum(0)
         # r before the measurement: H' F^-1 v + (I - K H)' r
@@ -63,7 +65,9 @@ def smooth(A, c, Q, y, R, start, spread):
         N[:, :m, :m] += Finv
         P = covariance[t]
         state[t] = predicted[t] + (P @ r[..., None])[..., 0]
-        variance[t] = np.einsum("bii->bi", P) - np.einsum("bij,bjk,bki->bi", P, N, P, optimize=True)
+        variance[t] = np.einsum("bii->bi", P) - np.einsum(
+            "bij,bjk,bki->bi", P, N, P, optimize=PAIRS
+        )
     return Smoothed(
         state, np.maximum(variance, 0.0), tuple(process), tuple(measurement), float(likelihood)
     )
@@ -86,7 +90,7 @@ def _forward(A, c, Q, y, known, R, start, spread):
         error = np.where(k, y[t] - x[:, :m], 0.0)
         likelihood -= 0.5 * (
             np.linalg.slogdet(F)[1].sum()
-            + np.einsum("bi,bij,bj->", error, inverse, error, optimize=True)
+            + np.einsum("bi,bij,bj->", error, inverse, error, optimize=PAIRS)
         )
         inverse = inverse * pair
         K = P[:, :, :m] @ inverse

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy import stats
 
+from diagnosis.common.distributions import chi2_sf, t_sf
 from diagnosis.recordings.columns import WIDTHS
 
 LEAST = 0.05  # p below which a value is not constant
@@ -57,7 +57,7 @@ def constancy(values: Sequence[float], standard_errors: Sequence[float]) -> floa
     if len(values) < 2:
         return 1.0
     mean = weights @ values / weights.sum()
-    return float(stats.chi2.sf(weights @ (values - mean) ** 2, len(values) - 1))
+    return float(chi2_sf(weights @ (values - mean) ** 2, len(values) - 1))
 
 
 def _known(values, standard_errors):
@@ -117,7 +117,7 @@ def goes_along(
         slope = (weights * x) @ y / (weights @ x**2)
         left = weights @ (y - slope * x) ** 2 / (len(x) - 2)
         error = np.sqrt(max(left, 1e-300) / (weights @ x**2))
-        p = min(1.0, len(tried) * 2 * float(stats.t.sf(abs(slope) / error, len(x) - 2)))
+        p = min(1.0, len(tried) * 2 * float(t_sf(abs(slope) / error, len(x) - 2)))
         if p < LEAST and (best is None or p < best[2]):
             best = name, float(slope), p
     return best

@@ -15,13 +15,15 @@ others' amounts.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+
+from diagnosis.common.distributions import t_sf
 
 # of a cell's median error over groups, that counts as none: one still window decides nothing
 SHARE = 0.1
 NOISE = 0.3  # of the noise, that counts as none
 GROSS = 5.0  # a window's error over the median, from which on it counts no more
 ITERATIONS = 3  # of reweighted least squares
+PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ def paired(before, after):
     gain = float(before.loss - after.loss)
     if not spread > 0 or not np.isfinite(spread):
         return Comparison(gain, spread, 1.0)
-    return Comparison(gain, spread, float(stats.t.sf(d.mean() / spread, n - 1)))
+    return Comparison(gain, spread, float(t_sf(d.mean() / spread, n - 1)))
 
 
 class Evidence:
@@ -97,9 +99,8 @@ class Evidence:
         z = np.concatenate([np.ones((*amounts.shape[:-1], 1)), -amounts], -1)
         g = self.gram[:, :, index][..., index]
         z = np.broadcast_to(z, (len(g), z.shape[-1]))
-        return np.maximum(np.einsum("gi,gcij,gj->gc", z, g, z, optimize=True), 0.0) / np.maximum(
-            self.count, 1
-        )
+        square = np.einsum("gi,gcij,gj->gc", z, g, z, optimize=PAIRS)
+        return np.maximum(square, 0.0) / np.maximum(self.count, 1)
 
     def losses(self, square):
         """Loss of every group (G,) from mean squared errors (G, cells)."""
@@ -126,9 +127,7 @@ class Evidence:
         weight = self.weight(index, amounts)
         each = np.einsum("gc,gcij->gij", weight, g)
         rest = each.sum(0) - each
-        left = np.array(
-            [bounded(r[1:, 1:] + np.diag(precision), r[1:, 0] + pull, low, high) for r in rest]
-        )
+        left = each_bounded(rest[:, 1:, 1:] + np.diag(precision), rest[:, 1:, 0] + pull, low, high)
         groups = self.losses(self._square(index, left))
         return Score(float(groups.mean()), groups, amounts)
 
@@ -165,6 +164,18 @@ def _weights(residual, inside):
         if usual
         else np.ones(len(square))
     )
+
+
+def each_bounded(matrices, vectors, low, high):
+    """bounded() of matrices (G, p, p) and vectors (G, p): those that meet no bound all at once."""
+    scale = np.sqrt(np.maximum(np.einsum("gii->gi", matrices), 1e-300))
+    even = matrices / (scale[:, :, None] * scale[:, None]) + 1e-9 * np.eye(len(low))
+    start = np.clip(np.zeros(len(low)), low, high)
+    free = np.linalg.solve(even, (vectors / scale)[..., None])[..., 0] / scale
+    out = start + (free - start)
+    for g in np.flatnonzero(~((free >= low) & (free <= high)).all(1)):
+        out[g] = bounded(matrices[g], vectors[g], low, high)
+    return out
 
 
 def bounded(matrix, vector, low, high):

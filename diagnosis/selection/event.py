@@ -9,8 +9,8 @@ Windows begin at smoothed states, which are free to move: what they explain is p
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
+from diagnosis.common.distributions import t_ppf
 from diagnosis.estimation import windows as cut
 
 SPAN = 0.2  # s, of a window
@@ -192,7 +192,7 @@ class Local:
         chi2 = float((left[0] ** 2).sum())
         error = np.sqrt(np.diag(inverse) * max(chi2 / freedom, 1.0)) / size
         half = np.zeros(len(values))
-        half[look.which] = stats.t.ppf(0.975, freedom) * error[:k] * look.steps
+        half[look.which] = t_ppf(0.975, freedom) * error[:k] * look.steps
         return chi2, half
 
     def lasting(self, gain, curves):

@@ -14,8 +14,8 @@ one simulation per effect; then its ends are moved and its values fitted in the 
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
+from diagnosis.common.distributions import chi2_ppf, f_sf
 from diagnosis.estimation import windows as cut
 from diagnosis.selection.event import SPAN, Local, Look, Windows, solved
 from diagnosis.selection.unmodelled_force import dependences
@@ -57,7 +57,7 @@ def find(world, recordings, setting, trajectory, noise):
         return None
     _, gain, a, b, spread, look = max(found, key=lambda f: f[0])
     k = len(look.which)
-    p = stats.f.sf(gain / k / spread, k, max(number - k, 1)) * number**2 * len(looks)
+    p = f_sf(gain / k / spread, k, max(number - k, 1)) * number**2 * len(looks)
     ceiling = usual + 4 * (usual - np.quantile(each, 0.16))  # of windows without an event
     excess = ((each - ceiling).clip(0) * scene.rows).sum()
     if p > LEVEL or gain < CONCENTRATED * excess:
@@ -114,7 +114,7 @@ def _interval(look, windows, usual):
     """
     k, found = len(look.which), []
     alone = (solved(look.gram, look.score) * look.score).sum(-1)
-    spread = max(usual, np.quantile(alone, 0.3) / stats.chi2.ppf(0.3, k))
+    spread = max(usual, np.quantile(alone, 0.3) / chi2_ppf(0.3, k))
     owner = [w.recording for w in windows]
     for r in dict.fromkeys(owner):
         mine = np.flatnonzero([o is r for o in owner])

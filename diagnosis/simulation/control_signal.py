@@ -79,14 +79,23 @@ class Signal:
     def _ramps(self, t):
         """Integral from the first row to times t of the undelayed control that follows at
         `rate`."""
-        seconds, value = np.diff(self.time), self.value
-        level, area = np.empty(len(value)), np.zeros(len(value))
-        level[0] = value[0]
-        for k, dt in enumerate(seconds):
-            level[k + 1], gained = _ramp(level[k], value[k], dt, self.rate)
-            area[k + 1] = area[k] + gained
+        # one number at a time: plain floats are ten times as quick as numpy's
+        seconds, value, rate = np.diff(self.time).tolist(), self.value.tolist(), float(self.rate)
+        now, total = value[0], 0.0
+        level, area = [now], [total]
+        for goal, dt in zip(value, seconds):
+            gap = goal - now
+            size, sign = abs(gap), (gap > 0) - (gap < 0)
+            reached = min(size / rate, max(dt, 0.0))
+            total += now * dt + sign * (
+                rate * (reached * reached) / 2 + size * (max(dt, 0.0) - reached)
+            )
+            now += sign * rate * reached
+            level.append(now)
+            area.append(total)
+        level, area = np.array(level), np.array(area)
         i = self._row(t)
-        return area[i] + _ramp(level[i], value[i], t - self.time[i], self.rate)[1]
+        return area[i] + _ramp(level[i], self.value[i], t - self.time[i], self.rate)[1]
 
     def _row(self, t):
         """The row that holds at times t; row 0 also before the recording."""
