@@ -11,12 +11,11 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from diagnosis.simulation.dry_friction import VariableFriction
 from diagnosis.simulation.editable_model import BALL, FREE, Working
 from diagnosis.simulation.readout import locate, read
+from diagnosis.simulation.stepwise import Stepwise
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 RUN_UP = (
     0.4,
     0.1,
@@ -39,10 +38,6 @@ class Engine:
         )
         self.hidden = owner >= nominal.nactuator
         self.batch = None
-        self.clones = (
-            {},
-            {},
-        )  # with and without what is conditional: of models whose friction varies with the state
 
     def run(self, cases, start_qpos, start_qvel, windows, rows, step, count, sensors):
         """World.simulate for n simulations that share structure, time step and way of stepping.
@@ -163,9 +158,7 @@ class Engine:
             drive(c.off, r, t, step, count, memo) if c.when else d
             for c, r, t, d in zip(cases, recordings, begin, on)
         ]
-        if self.batch is None or self.batch.nsim < n:
-            self.batch = Batch(self.model, 1 << (n - 1).bit_length(), threads())
-        batch = self.batch
+        batch = self._batch(n, cases[0].stepwise)
         batch.warning[:] = 0
         batch.state[:n] = self.rest
         batch.bind("qpos")[:n], batch.bind("qvel")[:n] = qpos, qvel
@@ -180,7 +173,7 @@ class Engine:
             for f in record
         }
         if cases[0].stepwise:
-            failed = self._step(batch, cases, recordings, on, off, begin, step, out)
+            failed = Stepwise(batch, cases, recordings, (on, off), begin, step).run(out)
         else:
             failed = self._rollout(batch, on, out)
         failed |= batch.warning[:n, :, 1].any(axis=1)
@@ -196,6 +189,14 @@ class Engine:
         else:
             act = np.zeros((n, 1 + count, self.model.na))
         return q, v, out.get("sensordata"), act
+
+    def _batch(self, n, stepwise):
+        """A Batch of n simulations, or more of those that run in one call, which is kept."""
+        if stepwise:  # its fields are expanded, each time others
+            return Batch(self.model, n, threads())
+        if self.batch is None or self.batch.nsim < n:
+            self.batch = Batch(self.model, 1 << (n - 1).bit_length(), threads())
+        return self.batch
 
     def _rollout(self, batch, drives, out):
         """Run all steps in one call; fill out, return which simulations failed (n,)."""
@@ -216,93 +217,6 @@ class Engine:
         except SimulationError as error:
             failed[error.ids] = True
         return failed
-
-    def _step(self, batch, cases, recordings, on, off, begin, step, out):
-        """As _rollout, with forces that depend on the state and conditions looked at before each
-        step."""
-        n, failed = len(cases), np.zeros(len(cases), bool)
-        ids, spare = np.arange(n), [self.model] * (batch.nsim - n)
-        live = {
-            f: batch.bind(f) for f in {"qpos", "qvel", "ctrl", "qfrc_applied", "xfrc_applied", *out}
-        }
-        ctrl, qfrc, xfrc = (
-            [np.array([getattr(d, f) for d in drives]) for drives in (on, off)]
-            for f in ("ctrl", "qfrc", "xfrc")
-        )
-        conditional = any(c.when for c in cases)
-        forces = [
-            self._functions(on, "force"),
-            self._functions(off, "force") if conditional else [],
-        ]
-        friction = [
-            VariableFriction(drives, self._functions(drives, "limit"), self.model, pool)
-            for drives, pool in zip((on, off)[: 1 + conditional], self.clones)
-        ]
-        rubbing = any(f.varying for f in friction)
-        rubs = [c.effect for case in cases for c, _ in case.on if c.effect.overrides("limit")]
-        loaded = any(effect.loaded for effect in rubs)
-        bias = batch.bind("qfrc_bias") if loaded else np.zeros((n, self.model.nv))
-        always, never = (-np.inf, np.inf), (np.inf, np.inf)
-        low, high = np.array(
-            [
-                always if not c.when else c.when["time"] if c.when["recording"] == r.name else never
-                for c, r in zip(cases, recordings)
-            ]
-        ).T
-        active = None
-        for k in range(out["qpos"].shape[1]):
-            time = begin + k * step
-            now = (low <= time) & (time < high)
-            if active is None or (now != active).any():
-                active = now
-                sides = zip(friction[0].models, friction[-1].models, active)
-                models = [a if yes else b for a, b, yes in sides]
-                batch.set_models(models + spare)
-            j, yes = min(k, ctrl[0].shape[1] - 1), active[:, None]
-            live["ctrl"][:n] = np.where(yes, ctrl[0][:, j], ctrl[1][:, j])
-            push = np.where(yes, *qfrc)
-            for functions, chosen in zip(forces, (active, ~active)):
-                for members, function in functions:
-                    added = function(
-                        live["qpos"][members],
-                        live["qvel"][members],
-                        live["ctrl"][members],
-                        time[members],
-                    )
-                    push[members] += np.where(chosen[members, None], added, 0.0)
-            if rubbing:
-                if loaded:
-                    batch.forward(ids, VELOCITY_STAGE)
-                state = [live[f][:n] for f in ("qpos", "qvel", "ctrl")]
-                for levels in friction:
-                    levels.set(*state, time, bias[:n])
-                batch.set_models(models + spare)
-            live["qfrc_applied"][:n] = push
-            live["xfrc_applied"][:n] = np.where(yes[..., None], *xfrc)
-            try:
-                batch.step(ids)
-            except SimulationError as error:
-                failed[error.ids] = True
-            for f in out:
-                out[f][:, k] = live[f][:n]
-        return failed
-
-    def _functions(self, drives, method):
-        """[(members, function)] of the state-dependent "force" or friction "limit" of
-        simulations."""
-        groups = {}
-        for s, drive in enumerate(drives):
-            for candidate, values in drive.items:
-                if candidate.effect.overrides(method) and drive.model is not None:
-                    groups.setdefault(candidate, []).append((s, values))
-        forces = []
-        for candidate, members in groups.items():
-            ids, values = map(np.array, zip(*members))
-            i = candidate.effect.id(self.model, candidate.place.name)
-            function = getattr(candidate.effect, method)([drives[s].model for s in ids], i, values)
-            if function is not None:
-                forces.append((ids, function))
-        return forces
 
     def _measures(self, cases):
         """(offset, ratio, delay) (3, n, ·) of the hinges and slides, and of sensordata."""
