@@ -101,48 +101,20 @@ def amplitudes(robot, level):
 
 def record(system, plan, rng, number=0, states=True):
     """Drive the system through one recording; returns a Run, or None where it flies apart."""
-    robot, model = system.robot, system.model
+    robot = system.robot
     references = [Reference(rng, a * rng.uniform(0.7, 1.3)) for a in amplitudes(robot, plan.level)]
     qpos, qvel = _start(system, references, rng, plan)
     system.run = number
     system.reset(qpos, qvel)
     stamps = _stamps(plan, rng)
-    sensor = Sensor(robot, model, plan, rng, system)
-    ctrl, measured, speeds, truth, snaps = [], [], [], [], []
-    trackers = [None] * len(robot.actuators)
-    for row, now in enumerate(stamps):
-        exact_q, exact_v = system.reading()
-        if (
-            not np.isfinite(exact_q).all()
-            or np.abs(exact_v).max() > 80
-            or np.abs(exact_q).max() > 15
-        ):
-            return None
-        seen = sensor.position(exact_q)
-        snaps.append(system.snapshot() if states else None)
-        u = np.array(
-            [
-                _control(system, k, references[k].at(now), seen, trackers, plan)
-                for k in range(len(robot.actuators))
-            ]
-        )
-        truth.append((exact_q, exact_v))
-        measured.append(seen)
-        speeds.append(sensor.speed(exact_v, seen))
-        ctrl.append(u)
-        if row + 1 < len(stamps):
-            system.advance(u, stamps[row + 1] - now)
-    time = stamps.copy()
-    if plan.stamps == "jitter":
-        time = stamps + plan.row * np.clip(0.1 * rng.normal(size=len(stamps)), -0.2, 0.2)
-        time -= time[0]
-    keep = np.ones(len(time), bool)
-    if plan.missing:
-        keep[1:-1] = rng.random(len(time) - 2) >= plan.missing
+    sensor = Sensor(robot, system.model, plan, rng, system)
+    driven = _drive(system, references, sensor, plan, stamps, states)
+    if driven is None:
+        return None
+    ctrl, measured, speeds, truth, snaps = driven
+    time, keep = _written(plan, stamps, rng)
     pick = lambda values: np.array(values)[keep]
-    rows = np.flatnonzero(keep)
-    gaps = np.diff(stamps)
-    sent = [[(ctrl[k], gaps[k]) for k in range(a, b)] for a, b in zip(rows, rows[1:])]
+    rows, gaps = np.flatnonzero(keep), np.diff(stamps)
     return Run(
         time=time[keep],
         ctrl=pick(ctrl).reshape(keep.sum(), len(robot.actuators)),
@@ -154,8 +126,47 @@ def record(system, plan, rng, number=0, states=True):
         states=[s for s, k in zip(snaps, keep) if k],
         number=number,
         touched=system.touched / max(system.steps, 1),
-        sent=sent,
+        sent=[[(ctrl[k], gaps[k]) for k in range(a, b)] for a, b in zip(rows, rows[1:])],
     )
+
+
+def _drive(system, references, sensor, plan, stamps, states):
+    """Step the system through all stamps; None where it flies apart.
+
+    Returns lists with an element a stamp: controls, measured positions and velocities, exact
+    (positions, velocities), and the system's state (None without `states`)."""
+    count = len(system.robot.actuators)
+    ctrl, measured, speeds, truth, snaps = [], [], [], [], []
+    trackers = [None] * count
+    for row, now in enumerate(stamps):
+        qpos, qvel = system.reading()
+        apart = np.abs(qvel).max() > 80 or np.abs(qpos).max() > 15
+        if apart or not np.isfinite(qpos).all():
+            return None
+        seen = sensor.position(qpos)
+        snaps.append(system.snapshot() if states else None)
+        controls = [
+            _control(system, k, references[k].at(now), seen, trackers, plan) for k in range(count)
+        ]
+        truth.append((qpos, qvel))
+        measured.append(seen)
+        speeds.append(sensor.speed(qvel, seen))
+        ctrl.append(np.array(controls))
+        if row + 1 < len(stamps):
+            system.advance(ctrl[-1], stamps[row + 1] - now)
+    return ctrl, measured, speeds, truth, snaps
+
+
+def _written(plan, stamps, rng):
+    """(T,) time as the recording tells it, and (T,) bool: which rows it holds."""
+    time = stamps.copy()
+    if plan.stamps == "jitter":
+        time = stamps + plan.row * np.clip(0.1 * rng.normal(size=len(stamps)), -0.2, 0.2)
+        time -= time[0]
+    keep = np.ones(len(time), bool)
+    if plan.missing:
+        keep[1:-1] = rng.random(len(time) - 2) >= plan.missing
+    return time, keep
 
 
 def _stamps(plan, rng):
