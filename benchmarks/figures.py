@@ -1,7 +1,6 @@
 """The README's figures and tables of the grounding runs, drawn from the committed CSVs.
 
-python benchmarks/figures.py        # results/grounding.png, transitions.png, and the tables on the
-terminal as Markdown
+python benchmarks/figures.py  # results/grounding.png, transitions.png, and Markdown tables
 """
 
 import csv
@@ -21,6 +20,7 @@ COLORS = {
     "oracle": "#555555",
     "physics": "#0f8b8d",
 }
+RETURN = "return on real, deterministic"
 
 
 def read(name):
@@ -50,67 +50,47 @@ def panels(count):
 
 
 def draw_grounding(rows, best):
-    """One panel per task: every seed thin, the mean thick with its standard error, both reference
-    lines."""
+    """One panel per task, those where grounding shows first."""
     told = [(key, algos) for key, algos in curves(rows).items() if key[2] == "default"]
-    table = dict(
-        sorted(told, key=lambda item: "Hopper" not in item[0][0])
-    )  # where grounding shows, first
+    table = dict(sorted(told, key=lambda item: "Hopper" not in item[0][0]))
     figure, all_axes = panels(len(table))
     for axes, ((env, policy, _), algos) in zip(all_axes, table.items()):
         for algo, seeds in algos.items():
-            for returns in seeds.values():
-                axes.plot(returns, color=COLORS[algo], lw=0.6, alpha=0.3)
-            length = min(map(len, seeds.values()))
-            values = np.array([returns[:length] for returns in seeds.values()])
-            mean, se = (
-                values.mean(0),
-                values.std(0, ddof=1) / np.sqrt(len(values))
-                if len(values) > 1
-                else np.zeros(length),
-            )
-            axes.plot(
-                mean,
-                color=COLORS[algo],
-                lw=2,
-                marker="o",
-                ms=3,
-                label=f"{algo}, {seeds_of(values)}",
-            )
-            axes.fill_between(
-                range(length), mean - se, mean + se, color=COLORS[algo], alpha=0.2, lw=0
-            )
-        lines = [
-            row
-            for row in best
-            if (row["env"], row["policy"], row["tag"], row["algo"])
-            == (env, policy, "default", "rgat")
-        ]
+            draw_seeds(axes, list(seeds.values()), algo)
+        key = env, policy, "default", "rgat"
+        lines = [r for r in best if (r["env"], r["policy"], r["tag"], r["algo"]) == key]
         for column, color in (
             ("trained_on_real", COLORS["real"]),
             ("before_grounding", COLORS["sim"]),
         ):
-            values = [
-                float(v)
-                for v in {row["seed"]: row[column] for row in lines if row[column]}.values()
-            ]
-            if values:
-                axes.axhline(
-                    np.mean(values),
-                    color=color,
-                    lw=1.2,
-                    ls="--",
-                    label=f"{column.replace('_', ' ')}, mean of {len(values)}",
-                )
-        axes.set(
-            title=f"{env}, {policy} policy",
-            xlabel="grounding step",
-            ylabel="return on real, deterministic",
-            ylim=(0, None),
-        )
+            by_seed = {row["seed"]: float(row[column]) for row in lines if row[column]}
+            if by_seed:
+                name = f"{column.replace('_', ' ')}, mean of {len(by_seed)}"
+                level(axes, list(by_seed.values()), color, name)
+        axes.set(title=f"{env}, {policy} policy", xlabel="grounding step", ylabel=RETURN)
+        axes.set(ylim=(0, None))
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.legend(fontsize=7, ncols=2, loc="lower right")
     figure.savefig(RESULTS / "grounding.png", dpi=110)
+
+
+def draw_seeds(axes, runs, algo):
+    """Every seed thin, the mean thick with its standard error. runs: [returns by grounding step]"""
+    for returns in runs:
+        axes.plot(returns, color=COLORS[algo], lw=0.6, alpha=0.3)
+    length = min(map(len, runs))
+    values = np.array([returns[:length] for returns in runs])
+    mean, se = values.mean(0), np.zeros(length)
+    if len(values) > 1:
+        se = values.std(0, ddof=1) / np.sqrt(len(values))
+    label = f"{algo}, {seeds_of(values)}"
+    axes.plot(mean, color=COLORS[algo], lw=2, marker="o", ms=3, label=label)
+    axes.fill_between(range(length), mean - se, mean + se, color=COLORS[algo], alpha=0.2, lw=0)
+
+
+def level(axes, values, color, label):
+    """A reference line at the mean of values."""
+    axes.axhline(np.mean(values), color=color, lw=1.2, ls="--", label=label)
 
 
 def seeds_of(values):
@@ -120,55 +100,33 @@ def seeds_of(values):
 def draw_transitions(rows, best):
     """Return on real against the real transitions that it took: diagnosis beside RGAT, every seed a
     line."""
-    mine = [
-        r
-        for r in rows
-        if r["tag"] == "default"
-        and r["policy"] == "deep"
-        and r["algo"] in ("physics", "rgat")
-        and int(r["grounding_step"])
-    ]
-    tasks = [
-        env
-        for env in sorted({r["env"] for r in mine})
-        if any(r["env"] == env and r["algo"] == "physics" for r in mine)
-    ]
+    deep = [r for r in rows if (r["tag"], r["policy"]) == ("default", "deep")]
+    mine = [r for r in deep if r["algo"] in ("physics", "rgat") and int(r["grounding_step"])]
+    tasks = sorted({r["env"] for r in mine if r["algo"] == "physics"})
     if not tasks:
         return
     figure, all_axes = panels(len(tasks))
     for axes, env in zip(all_axes, tasks):
         for algo in ("rgat", "physics"):
-            seeds = sorted({r["seed"] for r in mine if (r["env"], r["algo"]) == (env, algo)})
-            for i, seed in enumerate(seeds):
-                run = [r for r in mine if (r["env"], r["algo"], r["seed"]) == (env, algo, seed)]
-                x, y = (
-                    [float(r[k]) for r in run]
-                    for k in ("real_transitions", "real_return_deterministic")
-                )
-                label = None if i else f"{algo}, {seeds_of(seeds)}"
-                axes.semilogx(
-                    x, y, color=COLORS[algo], lw=1, marker="o", ms=4, alpha=0.7, label=label
-                )
-        lines = {
-            r["seed"]: float(r["trained_on_real"])
-            for r in best
-            if (r["env"], r["policy"], r["algo"]) == (env, "deep", "rgat")
-        }
-        axes.axhline(
-            np.mean(list(lines.values())),
-            color=COLORS["real"],
-            lw=1.2,
-            ls="--",
-            label="trained on real, mean",
-        )
-        axes.set(
-            title=env,
-            xlabel="real transitions used",
-            ylabel="return on real, deterministic",
-            ylim=(0, None),
-        )
+            draw_runs(axes, [r for r in mine if (r["env"], r["algo"]) == (env, algo)], algo)
+        key = env, "deep", "rgat"
+        told = [r for r in best if (r["env"], r["policy"], r["algo"]) == key]
+        lines = {r["seed"]: float(r["trained_on_real"]) for r in told}
+        level(axes, list(lines.values()), COLORS["real"], "trained on real, mean")
+        axes.set(title=env, xlabel="real transitions used", ylabel=RETURN, ylim=(0, None))
         axes.legend(fontsize=7)
     figure.savefig(RESULTS / "transitions.png", dpi=110)
+
+
+def draw_runs(axes, rows, algo):
+    """Every seed's return against its real transitions."""
+    seeds = sorted({r["seed"] for r in rows})
+    look = {"color": COLORS[algo], "lw": 1, "marker": "o", "ms": 4, "alpha": 0.7}
+    for i, seed in enumerate(seeds):
+        run = [r for r in rows if r["seed"] == seed]
+        x = [float(r["real_transitions"]) for r in run]
+        y = [float(r["real_return_deterministic"]) for r in run]
+        axes.semilogx(x, y, label=None if i else f"{algo}, {seeds_of(seeds)}", **look)
 
 
 def table(rows, best):

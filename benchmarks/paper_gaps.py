@@ -1,14 +1,14 @@
-"""Are the paper's three gaps named from one episode? Noisy positions of one real episode,
-diagnosed: results/paper_gaps.csv.
+"""Are the paper's three gaps named from one episode? results/paper_gaps.csv.
 
     python benchmarks/paper_gaps.py [--envs Hopper-v4] [--seeds 0 1 2]
 
-The policy that was trained in the sim acts at random as it learnt on "real" for one episode; what
+The policy that was trained in the sim acts at random as it learnt on "real" for one episode. What
 is recorded are the positions at every action, with Gaussian noise of 1 mm and 1 mrad, and the
-actions. One row per finding; finished ones are skipped.
+actions. diagnose() is given that. One row per finding; finished ones are skipped.
 """
 
 import argparse
+import itertools
 import sys
 import time
 from pathlib import Path
@@ -59,59 +59,47 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     args = parser.parse_args()
     torch.set_num_threads(1)
-    for env_id in args.envs:
-        for seed in args.seeds:
-            if finished(CSV, {"env": env_id, "seed": seed}):
-                continue
-            s = train.Settings(
-                env=env_id, seed=seed, pretrained=str(ROOT / "runs" / "pretrained")
-            ).completed()
-            recording = episode(s, seed)
-            began = time.process_time()
-            summary = diagnose(model_path(env_id), [recording]).summary
-            fit = summary["fit"]["held_out"]
-            common = {
-                "env": env_id,
-                "real": s.real,
-                "seed": seed,
-                "rows": len(recording.time),
-                "verdict": summary["verdict"],
-            }
-            errors = {f"held_out_{k}": round(fit[k], 4) for k in ("before", "after", "floor")}
-            rows = [
-                {
-                    **common,
-                    "effect": f["effect"],
-                    "place": f["place"]["name"],
-                    **described(f),
-                    **errors,
-                }
-                for f in summary["findings"]
-            ]
-            rows = rows or [
-                {
-                    **common,
-                    "effect": "",
-                    "place": "",
-                    "value": "",
-                    "low": "",
-                    "high": "",
-                    "also_possible": "",
-                    **errors,
-                }
-            ]
-            append(
-                CSV, [{**row, "cpu_seconds": round(time.process_time() - began, 1)} for row in rows]
-            )
-            for row in rows:
-                print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+    for env_id, seed in itertools.product(args.envs, args.seeds):
+        if finished(CSV, {"env": env_id, "seed": seed}):
+            continue
+        began = time.process_time()
+        rows = measure(env_id, seed)
+        seconds = {"cpu_seconds": round(time.process_time() - began, 1)}
+        append(CSV, [{**row, **seconds} for row in rows])
+        for row in rows:
+            print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+
+
+def measure(env_id, seed):
+    """A row per finding, and one without where there is none."""
+    kept = str(ROOT / "runs" / "pretrained")
+    s = train.Settings(env=env_id, seed=seed, pretrained=kept).completed()
+    recording = episode(s, seed)
+    summary = diagnose(model_path(env_id), [recording]).summary
+    common = {
+        "env": env_id,
+        "real": s.real,
+        "seed": seed,
+        "rows": len(recording.time),
+        "verdict": summary["verdict"],
+    }
+    fit = summary["fit"]["held_out"]
+    errors = {f"held_out_{k}": round(fit[k], 4) for k in ("before", "after", "floor")}
+    nothing = dict.fromkeys(("effect", "place", "value", "low", "high", "also_possible"), "")
+    told = [described(finding) for finding in summary["findings"]] or [nothing]
+    return [{**common, **each, **errors} for each in told]
 
 
 def described(finding):
-    """A finding's first parameter and its rivals."""
+    """A finding's name, first parameter and rivals."""
     first = (finding["parameters"] or [{}])[0]
     also = "; ".join(f"{a['effect']} {a['place']['name']}" for a in finding["also_possible"])
-    return {**{k: first.get(k, "") for k in ("value", "low", "high")}, "also_possible": also}
+    return {
+        "effect": finding["effect"],
+        "place": finding["place"]["name"],
+        **{k: first.get(k, "") for k in ("value", "low", "high")},
+        "also_possible": also,
+    }
 
 
 if __name__ == "__main__":

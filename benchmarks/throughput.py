@@ -119,7 +119,7 @@ def measure(env_id, num_envs, args):
     return np.array(rates), memory
 
 
-def main(argv=None):
+def arguments(argv):
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -142,41 +142,49 @@ def main(argv=None):
         help="cpu counts this process's own time: for a busy machine, with --threads 1",
     )
     parser.add_argument("--results", type=Path, default=ROOT / "results" / "throughput.csv")
-    args = parser.parse_args(argv)
-    rows = []
+    return parser.parse_args(argv)
+
+
+def main(argv=None):
+    args, rows = arguments(argv), []
     for env_id, num_envs in itertools.product(sorted(args.envs, reverse=True), args.num_envs):
         load = os.getloadavg()[0]
         with multiprocessing.get_context("spawn").Pool(1) as own:
             rates, memory = own.apply(measure, (env_id, num_envs, args))
-        a, b, stock, batched = np.median(rates, axis=0)
-        ratio = lambda i, j: round(float(np.median(rates[:, i] / rates[:, j])), 3)
-        row = {
-            "env": env_id,
-            "num_envs": num_envs,
-            "threads": args.threads or os.cpu_count(),
-            "rounds": args.rounds,
-            "clock": args.clock,
-            "load_before": round(load, 1),
-            "physics_steps_per_s": round(a),
-            "trpo_steps_per_s": round(b),
-            "sb3_one_env_steps_per_s": round(stock),
-            "sb3_batched_steps_per_s": round(batched),
-            "trpo_to_physics": ratio(1, 0),
-            "trpo_to_sb3_one_env": ratio(1, 2),
-            "trpo_to_sb3_batched": ratio(1, 3),
-            "peak_mib_beyond_torch": round(memory),
-        }
-        rows.append(row)
-        print(
-            f"{env_id}, {num_envs} environments: "
-            + ", ".join(f"{k} {v}" for k, v in rows[-1].items() if k not in ("env", "num_envs")),
-            flush=True,
+        rows.append(
+            {
+                "env": env_id,
+                "num_envs": num_envs,
+                "threads": args.threads or os.cpu_count(),
+                "rounds": args.rounds,
+                "clock": args.clock,
+                "load_before": round(load, 1),
+                **compared(rates),
+                "peak_mib_beyond_torch": round(memory),
+            }
         )
+        told = ", ".join(f"{k} {v}" for k, v in rows[-1].items() if k not in ("env", "num_envs"))
+        print(f"{env_id}, {num_envs} environments: {told}", flush=True)
     args.results.parent.mkdir(parents=True, exist_ok=True)
     with args.results.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def compared(rates):
+    """Medians over rounds of the rates (rounds, 4) and of their quotients."""
+    a, b, stock, batched = np.median(rates, axis=0)
+    ratio = lambda i, j: round(float(np.median(rates[:, i] / rates[:, j])), 3)
+    return {
+        "physics_steps_per_s": round(a),
+        "trpo_steps_per_s": round(b),
+        "sb3_one_env_steps_per_s": round(stock),
+        "sb3_batched_steps_per_s": round(batched),
+        "trpo_to_physics": ratio(1, 0),
+        "trpo_to_sb3_one_env": ratio(1, 2),
+        "trpo_to_sb3_batched": ratio(1, 3),
+    }
 
 
 if __name__ == "__main__":

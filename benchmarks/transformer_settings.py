@@ -57,50 +57,47 @@ def main():
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     args = parser.parse_args()
     torch.set_num_threads(1)
+    kept = str(ROOT / "runs" / "pretrained")
     for seed in args.seeds:
-        s = train.Settings(
-            env=args.env, seed=seed, threads=1, pretrained=str(ROOT / "runs" / "pretrained")
-        ).completed()
-        todo = [dict(zip(COLUMNS, values)) for values in VARIANTS]
-        todo = [
-            {**v, "at_std": v["at_std"] or s.at_std} if v["method"] == "rgat" else v for v in todo
-        ]
-        todo = [v for v in todo if not finished(CSV, {"env": s.env, "seed": seed, **v})]
-        if not todo:
-            continue
-        sim, real = (
-            BatchEnv(s.env, s.num_envs, nthread=1),
-            BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=1),
-        )
-        learner = train.new_learner(s)
-        learner.load(train.pretrained(s, "sim", sim, s.pretrain_steps, Quiet()))
-        tau_real = rollouts(learner.policy, real, s.real_trajectories, seed + 1)[1]
-        held_out = rollouts(learner.policy, real, s.eval_episodes, seed + 1000)[1]
-        for v in todo:
-            began = time.monotonic()
-            grounding, world, fit = ground(s, v, sim, real, learner.policy, tau_real, seed)
-            error, change = one_step_error(world, grounding.transformer, held_out)
-            returns = [
-                rollouts(learner.policy, GroundedEnv(world, grounding.transformer), 64, seed, d)[
-                    0
-                ].mean()
-                for d in (True, False)
-            ]
-            row = {
-                "env": s.env,
-                "seed": seed,
-                **v,
-                "at_steps": s.at_steps,
-                "forward_model_error": "",
-                **fit,
-                "one_step_error": error,
-            }
-            row |= {
-                "delta_action_rms": change,
-                "return_deterministic": returns[0],
-                "return_stochastic": returns[1],
-            }
-            append(CSV, [{**row, "seconds": round(time.monotonic() - began, 1)}])
+        s = train.Settings(env=args.env, seed=seed, threads=1, pretrained=kept).completed()
+        variants = [dict(zip(COLUMNS, values)) for values in VARIANTS]
+        for variant in variants:
+            if variant["method"] == "rgat":
+                variant["at_std"] = variant["at_std"] or s.at_std
+        new = lambda v: not finished(CSV, {"env": s.env, "seed": seed, **v})
+        measure(s, list(filter(new, variants)))
+
+
+def measure(s, variants):
+    """Append a row for each variant, all from the same policy and the same real data."""
+    if not variants:
+        return
+    sim = BatchEnv(s.env, s.num_envs, nthread=1)
+    real = BatchEnv(s.env, s.num_envs, parse_perturbation(s.real), nthread=1)
+    learner = train.new_learner(s)
+    learner.load(train.pretrained(s, "sim", sim, s.pretrain_steps, Quiet()))
+    policy = learner.policy
+    tau_real = rollouts(policy, real, s.real_trajectories, s.seed + 1)[1]
+    held_out = rollouts(policy, real, s.eval_episodes, s.seed + 1000)[1]
+    for v in variants:
+        began = time.monotonic()
+        grounding, world, fit = ground(s, v, sim, real, policy, tau_real, s.seed)
+        error, change = one_step_error(world, grounding.transformer, held_out)
+        grounded = GroundedEnv(world, grounding.transformer)
+        returned = lambda deterministic: rollouts(policy, grounded, 64, s.seed, deterministic)[0]
+        row = {
+            "env": s.env,
+            "seed": s.seed,
+            **v,
+            "at_steps": s.at_steps,
+            "forward_model_error": "",
+            **fit,
+            "one_step_error": error,
+            "delta_action_rms": change,
+            "return_deterministic": returned(True).mean(),
+            "return_stochastic": returned(False).mean(),
+        }
+        append(CSV, [{**row, "seconds": round(time.monotonic() - began, 1)}])
 
 
 def ground(s, v, sim, real, policy, tau_real, seed):
@@ -112,9 +109,8 @@ def ground(s, v, sim, real, policy, tau_real, seed):
         settings = dataclasses.replace(
             settings, at=at, at_std=v["at_std"], residual=v["forward_model"] == "residual"
         )
-    grounding = (
-        method(world, settings, real.model) if v["method"] == "oracle" else method(world, settings)
-    )
+    told = (real.model,) if v["method"] == "oracle" else ()
+    grounding = method(world, settings, *told)
     fit = grounding.fit(tau_real, seed)
     grounding.update(policy, s.at_steps, seed)
     return grounding, world, fit

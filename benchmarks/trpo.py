@@ -1,10 +1,8 @@
 """How well TRPO learns, beside sb3-contrib's TRPO with the same settings in the same environments.
 
-    python benchmarks/trpo.py                                          # everything, one after the
-    other
+    python benchmarks/trpo.py                   # everything, one after the other
     python benchmarks/trpo.py --implementations ours --envs Hopper-v4 --seeds 0 1 2 --threads 1
-    python benchmarks/trpo.py --implementations ours --envs HalfCheetah-v4 --seeds 100 101 102
-    --max-kl 0.04
+    python benchmarks/trpo.py --implementations ours --envs HalfCheetah-v4 --max-kl 0.04
 
 Appends a row per finished training to results/trpo.csv and skips what is there, so parts may run
 side by side and be stopped at will. An environment is a gymnasium id, perturbed if a change
@@ -67,7 +65,7 @@ def train_sb3(name, config, seed, steps, num_envs, threads):
 IMPLEMENTATIONS = {"ours": train_ours, "sb3-contrib": train_sb3}
 
 
-def main(argv=None):
+def arguments(argv):
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -99,41 +97,47 @@ def main(argv=None):
         "--threads", type=int, default=0, help="cores for each training (default: all)"
     )
     parser.add_argument("--results", type=Path, default=ROOT / "results" / "trpo.csv")
-    args = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def main(argv=None):
+    args = arguments(argv)
     if args.threads:
         torch.set_num_threads(args.threads)
     for implementation in args.implementations:
         for name in args.envs or ORIGINALS + PERTURBED * (implementation == "ours"):
-            task = name.partition("-")[0]
-            steps, config, label = args.steps or STEPS[task], PRESETS[task], implementation
-            if args.max_kl:
-                config, label = (
-                    dataclasses.replace(config, max_kl=args.max_kl),
-                    f"{label} max_kl={args.max_kl:g}",
-                )
-            if args.num_envs != Settings.num_envs:
-                label += f" num_envs={args.num_envs}"
             for seed in args.seeds or range(SEEDS[implementation]):
-                key = {"implementation": label, "env": name, "seed": seed, "steps": steps}
-                if finished(args.results, key):
-                    continue
-                start = time.process_time()
-                policy = IMPLEMENTATIONS[implementation](
-                    name, config, seed, steps, args.num_envs, args.threads
-                )
-                seconds = time.process_time() - start
-                env = make_env(name, args.episodes, args.threads)
-                judge = lambda deterministic: float(
-                    np.mean(rollouts(policy, env, args.episodes, 10_000 + seed, deterministic)[0])
-                )
-                row = {
-                    **key,
-                    "return_deterministic": round(judge(True), 1),
-                    "return_stochastic": round(judge(False), 1),
-                    "seconds": round(seconds, 1),
-                }
-                append(args.results, [row])
-                print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+                measure(implementation, name, seed, args)
+
+
+def measure(implementation, name, seed, args):
+    """Append the row of one training, where there is none yet."""
+    task = name.partition("-")[0]
+    steps, config, label = args.steps or STEPS[task], PRESETS[task], implementation
+    if args.max_kl:
+        config = dataclasses.replace(config, max_kl=args.max_kl)
+        label += f" max_kl={args.max_kl:g}"
+    if args.num_envs != Settings.num_envs:
+        label += f" num_envs={args.num_envs}"
+    key = {"implementation": label, "env": name, "seed": seed, "steps": steps}
+    if finished(args.results, key):
+        return
+    start = time.process_time()
+    learn = IMPLEMENTATIONS[implementation]
+    policy = learn(name, config, seed, steps, args.num_envs, args.threads)
+    seconds = time.process_time() - start
+    env = make_env(name, args.episodes, args.threads)
+    judge = lambda deterministic: float(
+        np.mean(rollouts(policy, env, args.episodes, 10_000 + seed, deterministic)[0])
+    )
+    row = {
+        **key,
+        "return_deterministic": round(judge(True), 1),
+        "return_stochastic": round(judge(False), 1),
+        "seconds": round(seconds, 1),
+    }
+    append(args.results, [row])
+    print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
 
 
 if __name__ == "__main__":
