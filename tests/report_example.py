@@ -1,4 +1,4 @@
-"""A diagnosis to draw: of the arm in malformed.py, with friction at the elbow, every number made
+"""A diagnosis to draw: of the arm in arm.py, with friction at the elbow, every number made
 up.
 
 diagnosis = example()        # what writer.write and sections.html_page take
@@ -7,7 +7,7 @@ diagnosis = example()        # what writer.write and sections.html_page take
 import types
 
 import numpy as np
-from malformed import ARM, arm, run
+from arm import ARM, arm, run
 
 from diagnosis.effects import unmodelled
 from diagnosis.recordings.recording import Recording

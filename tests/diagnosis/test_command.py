@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 ROOT = str(Path(__file__).resolve().parents[2])
+from arm import ARM, run, text
 from contract import contract
-from malformed import ARM, cases, run, text
+from malformed import cases
 
 from diagnosis import command as diagnose
 from diagnosis.estimation import prediction_error

@@ -2,7 +2,7 @@
 
 import mujoco
 import numpy as np
-from malformed import ARM, arm
+from arm import ARM, arm
 
 from diagnosis import findings
 from diagnosis.effects import unmodelled

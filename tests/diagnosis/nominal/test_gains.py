@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from malformed import ARM, arm
+from arm import ARM, arm
 
 from diagnosis.command import gain_words
 from diagnosis.nominal.model import ModelError, gains_of, load_world, together, with_gains

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from malformed import arm, run
+from arm import arm, run
 
 from diagnosis.recordings.cleaning import without_defects
 from diagnosis.recordings.recording import Recording

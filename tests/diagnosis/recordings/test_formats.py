@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from arm import ARM, archive, arm, run, text
 from bags import joint_state, write_bag
-from malformed import ARM, archive, arm, run, text
 from pyarrow import parquet
 
 from diagnosis.recordings.column_map import load_layout

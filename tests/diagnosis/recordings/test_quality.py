@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from malformed import arm, run
+from arm import arm, run
 from scipy.signal import lfilter
 
 from diagnosis.recordings.quality import (

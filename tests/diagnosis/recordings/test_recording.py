@@ -10,9 +10,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from arm import ARM, HEADER, archive, arm, run, text, whole
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from malformed import ARM, HEADER, archive, arm, run, text, whole
 
 from diagnosis.recordings.columns import columns_of
 from diagnosis.recordings.plausibility import check

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from malformed import arm, run
+from arm import arm, run
 from scipy import stats
 
 from diagnosis.recordings.recording import Recording

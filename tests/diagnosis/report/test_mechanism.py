@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from malformed import ARM, arm
+from arm import ARM, arm
 from report_example import recordings
 
 from diagnosis.recordings import inverse_dynamics

@@ -4,7 +4,7 @@ machine agree."""
 import mujoco
 import numpy as np
 import pytest
-from malformed import ARM
+from arm import ARM
 
 from diagnosis.nominal.model import load_world
 from diagnosis.recordings.recording import Recording

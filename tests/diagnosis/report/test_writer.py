@@ -9,8 +9,8 @@ import subprocess
 import mujoco
 import numpy as np
 import pytest
+from arm import arm
 from contract import contract, strict
-from malformed import arm
 
 from diagnosis.effects import unmodelled
 from diagnosis.report import sections, writer

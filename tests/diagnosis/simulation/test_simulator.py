@@ -255,6 +255,24 @@ def test_sensors_of_the_model(case):
     np.testing.assert_allclose(data[0, 0, 1:], stepped.sensordata[1:] + 0.3, atol=1e-12)
 
 
+BETWEEN = 0.2 - 1e-9, 0.5 - 1e-9  # s, of the recording
+
+
+def switched(model, recording, act):
+    """(71,) angles of rows 5 to 75, by a loop that calls act(data, time) before every step."""
+    data, out = mujoco.MjData(model), []
+    data.qpos[0], data.qvel[0] = 0.3, 0.5
+    model.dof_solref[0], model.dof_solimp[0] = (0.004, 1), (0.999, 0.9999, 0.001, 0.5, 2)
+    for row in range(5, 76):
+        out.append(data.qpos[0])
+        data.ctrl[0] = recording.ctrl[row, 0]
+        for k in range(10):
+            act(data, recording.time[row] + k * 0.001)
+            mujoco.mj_step(model, data)
+    model.dof_frictionloss[0] = model.dof_damping[0] = 0
+    return np.array(out)
+
+
 def test_effects_under_a_condition():
     """A load in the middle of the run, friction in part of the range: against a loop that switches
     them."""
@@ -264,51 +282,31 @@ def test_effects_under_a_condition():
     window, model = Window(recording, 5, 75), world.model
     body = model.body(1).name
 
-    def loop(act):
-        data, out = mujoco.MjData(model), []
-        data.qpos[0], data.qvel[0] = 0.3, 0.5
-        model.dof_solref[0], model.dof_solimp[0] = (0.004, 1), (0.999, 0.9999, 0.001, 0.5, 2)
-        for row in range(5, 76):
-            out.append(data.qpos[0])
-            data.ctrl[0] = recording.ctrl[row, 0]
-            for k in range(10):
-                act(model, data, time[row] + k * 0.001)
-                mujoco.mj_step(model, data)
-        model.dof_frictionloss[0] = model.dof_damping[0] = 0
-        return np.array(out)
+    def push(data, t):
+        data.xfrc_applied[1, 0] = 3.0 if BETWEEN[0] <= t < BETWEEN[1] else 0.0
 
-    def push(m, d, t):
-        d.xfrc_applied[1, 0] = 3.0 if 0.2 - 1e-9 <= t < 0.5 - 1e-9 else 0.0
+    def rub(data, t):
+        model.dof_frictionloss[0] = 0.4 * (BETWEEN[0] <= t < BETWEEN[1])
 
-    def rub(m, d, t):
-        m.dof_frictionloss[0] = 0.4 * (0.2 - 1e-9 <= t < 0.5 - 1e-9)
-
-    when = {"recording": "run", "time": [0.2 - 1e-9, 0.5 - 1e-9]}
-    force = world.localised(world.candidate("external_force", body), when)
+    when = {"recording": "run", "time": list(BETWEEN)}
+    pushed = world.candidate("external_force", body)
+    force = world.localised(pushed, when)
     friction = world.localised(world.candidate("coulomb_friction", "j"), when)
-    elsewhere = world.localised(
-        world.candidate("external_force", body), when | {"recording": "another"}
-    )
-    later = world.localised(world.candidate("coulomb_friction", "j"), when | {"time": [0.6, 0.7]})
+    elsewhere = world.localised(pushed, when | {"recording": "another"})
     load = world.localised(world.candidate("payload_change", body), when)
-    settings_ = [
-        {force: (3.0, 0.0, 0.0)},
-        {friction: (0.4,)},
-        {elsewhere: (3.0, 0.0, 0.0)},
-        {load: (0.9,)},
-        {},
-    ]
-    qpos, _ = world.simulate(settings_, [[0.3]] * 5, [[0.5]] * 5, [window] * 5)
+    forced = {force: (3.0, 0.0, 0.0)}
+    settings = [forced, {friction: (0.4,)}, {elsewhere: (3.0, 0.0, 0.0)}, {load: (0.9,)}, {}]
+    qpos, _ = world.simulate(settings, [[0.3]] * 5, [[0.5]] * 5, [window] * 5)
     for row, act in zip(qpos, (push, rub)):
-        np.testing.assert_allclose(row[:, 0], loop(act), rtol=0, atol=1e-9)
+        expected = switched(model, recording, act)
+        np.testing.assert_allclose(row[:, 0], expected, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(qpos[2], qpos[4])
     assert abs(qpos[0] - qpos[4]).max() > 0.01 and abs(qpos[3] - qpos[4]).max() > 0.01
-    assert force != world.candidate("external_force", body) and force == world.localised(
-        force, dict(when)
-    )
-    assert world.corrected_xml({force: (3.0, 0.0, 0.0)})[1] == {force: "none"}
+    assert force != pushed and force == world.localised(force, dict(when))
+    assert world.corrected_xml(forced)[1] == {force: "none"}
+    later = world.localised(world.candidate("coulomb_friction", "j"), when | {"time": [0.6, 0.7]})
     with pytest.raises(ValueError, match="different conditions"):
-        world.simulate([{force: (3.0, 0.0, 0.0), later: (0.4,)}], [[0.3]], [[0.5]], [window])
+        world.simulate([{**forced, later: (0.4,)}], [[0.3]], [[0.5]], [window])
 
 
 def test_unstable_simulations_are_nan_and_silent(tmp_path, monkeypatch, capfd):
