@@ -46,63 +46,71 @@ class Engine:
         nsensordata).
         """
         measures, sensor_measures = self._measures(cases)
-        (offset, ratio, delay), recordings = measures, [w.recording for w in windows]
+        late = measures[2].max(axis=1, initial=0.0)
+        if sensors:
+            late = np.maximum(late, sensor_measures[2].max(axis=1, initial=0.0))
         # a window begins as long before its first row as its latest sensor is late, but not before
         # the recording
-        early = np.maximum(
-            delay.max(axis=1, initial=0.0), sensors * sensor_measures[2].max(axis=1, initial=0.0)
-        )
-        early = np.minimum(
-            early, [w.recording.time[w.first] - w.recording.time[0] for w in windows]
-        )
+        early = np.array([w.recording.time[w.first] - w.recording.time[0] for w in windows])
+        early = np.minimum(late, early)
         begin = np.array([w.recording.time[w.first] for w in windows]) - early
-        q, v = self._true(start_qpos, start_qvel, measures)
-        qpos, qvel = (
-            np.tile(self.model.qpos0, (len(cases), 1)),
-            np.zeros((len(cases), self.model.nv)),
-        )
-        act = None
-        if self.model.nq > self.nominal.nq or self.hidden.any():
-            qpos, qvel, act = self._run_up(cases, windows, begin, measures, step)
-        qpos[:, self.q], qvel[:, self.v] = q, v
+        shown = start_qpos, start_qvel
+        qpos, qvel, act = self._starts(cases, windows, begin, shown, measures, step)
+        recordings = [w.recording for w in windows]
         if early.any():
             lead = int(np.ceil(early.max() / step)) + 1
-            for _ in range(SHOTS):
-                trial = self._trajectory(cases, recordings, begin, qpos, qvel, step, lead, act=act)
-                shown = read(
-                    self.nominal,
-                    trial[0][..., self.q],
-                    trial[1][..., self.v],
-                    early[:, None],
-                    step,
-                    delay,
-                )
-                qpos[:, self.q] += q - shown[0][:, 0]
-                qvel[:, self.v] += v - shown[1][:, 0]
+            states = qpos, qvel, act
+            self._shoot(cases, recordings, begin, states, shown, early, measures, step, lead)
             count += lead
-
         q, v, data, _ = self._trajectory(
             cases, recordings, begin, qpos, qvel, step, count, sensors, act
         )
         time = np.full((len(cases), rows), np.nan)
         for s, w in enumerate(windows):
             time[s, : w.last - w.first + 1] = w.recording.time[w.first : w.last + 1] - begin[s]
+        qpos, qvel = self._read(q, v, time, step, measures)
+        qpos[:, 0], qvel[:, 0] = shown
+        if not sensors:
+            return qpos, qvel
+        return qpos, qvel, _read_sensors(data, time, step, sensor_measures)
+
+    def _starts(self, cases, windows, begin, shown, measures, step):
+        """States (n, ·) of the working model at `begin`, and its activations or None, from what is
+        shown."""
+        n, act = len(cases), None
+        qpos, qvel = np.tile(self.model.qpos0, (n, 1)), np.zeros((n, self.model.nv))
+        if self.model.nq > self.nominal.nq or self.hidden.any():
+            qpos, qvel, act = self._run_up(cases, windows, begin, measures, step)
+        qpos[:, self.q], qvel[:, self.v] = self._true(*shown, measures)
+        return qpos, qvel, act
+
+    def _shoot(self, cases, recordings, begin, states, shown, early, measures, step, lead):
+        """Correct states (qpos, qvel, act) in place until delayed sensors show what they should
+        `early` seconds later, within `lead` steps."""
+        qpos, qvel, act = states
+        q, v = self._true(*shown, measures)
+        for _ in range(SHOTS):
+            trial = self._trajectory(cases, recordings, begin, qpos, qvel, step, lead, act=act)
+            found = read(
+                self.nominal,
+                trial[0][..., self.q],
+                trial[1][..., self.v],
+                early[:, None],
+                step,
+                measures[2],
+            )
+            qpos[:, self.q] += q - found[0][:, 0]
+            qvel[:, self.v] += v - found[1][:, 0]
+
+    def _read(self, q, v, time, step, measures):
+        """qpos (n, rows, nq), qvel (n, rows, nv) as the joints' sensors show a trajectory at times
+        (n, rows)."""
+        offset, ratio, delay = measures
         qpos, qvel = read(self.nominal, q[..., self.q], v[..., self.v], time, step, delay)
         simple_q, simple_v = simple(self.nominal)
         qpos[..., simple_q] = qpos[..., simple_q] * ratio[:, None] + offset[:, None]
         qvel[..., simple_v] *= ratio[:, None]
-        qpos[:, 0], qvel[:, 0] = start_qpos, start_qvel
-        if not sensors:
-            return qpos, qvel
-        offset, ratio, delay = sensor_measures
-        s, k, f = locate(np.maximum(time[..., None] - delay[:, None], 0.0) / step, count + 1)
-        column = np.arange(delay.shape[1])
-        values = (1 - f) * data[s, k, column] + f * data[s, np.minimum(k + 1, count), column]
-        return (
-            qpos,
-            qvel,
-            np.where(np.isnan(time)[..., None], np.nan, values * ratio[:, None] + offset[:, None]),
-        )
+        return qpos, qvel
 
     def _true(self, qpos, qvel, measures):
         """Positions and velocities behind what sensors show, but for their delays."""
@@ -246,6 +254,18 @@ def threads():
     all CPUs (0)."""
     number = os.environ.get("OMP_NUM_THREADS", "")
     return int(number) if number.isdigit() else 0
+
+
+def _read_sensors(data, time, step, measures):
+    """(n, rows, nsensordata) that sensors show at times (n, rows) of data (n, steps, ·), at the
+    state before each step."""
+    offset, ratio, delay = measures
+    last = data.shape[1] - 1
+    s, k, f = locate(np.maximum(time[..., None] - delay[:, None], 0.0) / step, last + 1)
+    column = np.arange(delay.shape[1])
+    values = (1 - f) * data[s, k, column] + f * data[s, np.minimum(k + 1, last), column]
+    shown = values * ratio[:, None] + offset[:, None]
+    return np.where(np.isnan(time)[..., None], np.nan, shown)
 
 
 def simple(model):

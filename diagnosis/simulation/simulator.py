@@ -219,32 +219,37 @@ class World:
             groups.setdefault((case.structure, case.step, case.stepwise, case.late), []).append(
                 (s, case)
             )
-        start_qpos, start_qvel = np.asarray(start_qpos, float), np.asarray(start_qvel, float)
+        starts = np.asarray(start_qpos, float), np.asarray(start_qvel, float)
         with quiet():
-            for (structure, step, *_), members in groups.items():
-                engine = self.engine(structure)
-                duration = max(
-                    r.time[last] - r.time[first]
-                    for r, first, last in (windows[s] for s, _ in members)
-                )
-                count = max(1, int(np.ceil(duration / step - SLACK)))
-                width = (
-                    self.model.nu
-                    + engine.model.nq
-                    + engine.model.nv
-                    + sensors * self.model.nsensordata
-                )
-                chunk = int(np.clip(CHUNK_BYTES / (8 * count * width), 1, 1024))
-                for k in range(0, len(members), chunk):
-                    ids, chosen = zip(*members[k : k + chunk])
-                    ids = list(ids)
-                    some = [windows[s] for s in ids]
-                    run = engine.run(
-                        chosen, start_qpos[ids], start_qvel[ids], some, rows, step, count, sensors
-                    )
-                    for whole, part in zip(out, run):
-                        whole[ids] = part
+            for members in groups.values():
+                self._run(members, starts, windows, sensors, out)
         return tuple(out) if sensors else tuple(out[:2])
+
+    def _run(self, members, starts, windows, sensors, out):
+        """Fill out for members [(simulation, Case)] alike in structure, step and way of
+        stepping."""
+        _, first = members[0]
+        engine, step = self.engine(first.structure), first.step
+        duration = max(
+            r.time[last] - r.time[begin] for r, begin, last in (windows[s] for s, _ in members)
+        )
+        count = max(1, int(np.ceil(duration / step - SLACK)))
+        width = self.model.nu + engine.model.nq + engine.model.nv + sensors * self.model.nsensordata
+        chunk = int(np.clip(CHUNK_BYTES / (8 * count * width), 1, 1024))
+        for k in range(0, len(members), chunk):
+            ids, chosen = zip(*members[k : k + chunk])
+            ids = list(ids)
+            run = engine.run(
+                chosen,
+                *(start[ids] for start in starts),
+                [windows[s] for s in ids],
+                out[0].shape[1],
+                step,
+                count,
+                sensors,
+            )
+            for whole, part in zip(out, run):
+                whole[ids] = part
 
     def engine(self, structure):
         """The Engine for a frozenset of the candidates that need parts of their own, made once."""
