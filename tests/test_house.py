@@ -1,8 +1,7 @@
 """The house: imports run downward only, and what is written fits on a screen.
 
-`tests/house_debt.csv` lists the files that have lines of more than 100 columns, and the functions
-of more than 50 lines, from before these rules. It shrinks: who mends one takes it off, nobody adds
-any.
+`tests/house_debt.csv` lists the functions of more than 50 lines that stay, and why. Nobody adds
+any, nor lines of more than 100 columns.
 """
 
 import ast
@@ -128,13 +127,17 @@ def measured():
 
 def test_nothing_new_is_too_long():
     with open(ROOT / "tests/house_debt.csv", newline="") as stream:
-        debt = {(row["file"], row["what"]): int(row["most"]) for row in csv.DictReader(stream)}
+        rows = list(csv.DictReader(stream))
+    debt = {(row["file"], row["what"]): int(row["most"]) for row in rows}
     grown = {key: n for key, n in measured().items() if n > debt.get(key, 0)}
     assert grown == {}, "wrap these lines, cut these functions; the list is not to grow"
+    assert all(row["why"] for row in rows)
 
 
-if __name__ == "__main__":  # writes the list anew: python tests/test_house.py
+if __name__ == "__main__":  # takes off the list what is mended: python tests/test_house.py
+    with open(ROOT / "tests/house_debt.csv", newline="") as stream:
+        why = {(row["file"], row["what"]): row["why"] for row in csv.DictReader(stream)}
     with open(ROOT / "tests/house_debt.csv", "w", newline="") as stream:
         rows = csv.writer(stream, lineterminator="\n")
-        rows.writerow(("file", "what", "most"))
-        rows.writerows((*key, count) for key, count in sorted(measured().items()))
+        rows.writerow(("file", "what", "most", "why"))
+        rows.writerows((*key, n, why.get(key, "")) for key, n in sorted(measured().items()))

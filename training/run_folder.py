@@ -20,11 +20,11 @@ import mujoco
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from PIL import Image, ImageDraw
 from tqdm import tqdm
 
 from diagnosis.common.atomic_files import write_table, write_whole
 from models import GaussianPolicy, load_checkpoint
+from training.replay import animate as animate  # for train.py
 
 PROGRESS = (
     "grounding_step real_transitions real_transitions_judging sim_steps "
@@ -355,87 +355,3 @@ class Bar:
 
     def say(self, line):
         self.tqdm.write(line)
-
-
-# --- replay: the planar robots drawn from their geoms, with no need of OpenGL ---------------------
-
-
-SIZE, SCALE = (400, 300), 110  # of a frame in pixels, and pixels per metre
-MOST, EVERY = 500, 4  # steps shown, and steps per frame
-
-
-def draw(model, data, x, title):
-    """One frame: every capsule of the model projected on the x-z plane, the camera at x."""
-    image = Image.new("RGB", SIZE, "#f7f7f4")
-    pen = ImageDraw.Draw(image)
-    to_pixel = lambda p: (SIZE[0] / 2 + SCALE * (p[0] - x), SIZE[1] * 0.82 - SCALE * p[2])
-    ground = to_pixel((0, 0, 0))[1]
-    pen.rectangle((0, ground, *SIZE), fill="#dcd9cf")
-    for mark in np.arange(np.floor(x) - 3, x + 4, 0.5):
-        pen.line((to_pixel((mark, 0, 0)), (to_pixel((mark, 0, 0))[0], ground + 6)), fill="#8f8b80")
-    for geom in range(model.ngeom):
-        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
-            continue
-        radius, half = model.geom_size[geom, :2]
-        axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * half
-        ends = [to_pixel(data.geom_xpos[geom] + sign * axis) for sign in (-1, 1)]
-        color = "#8f8b80" if model.geom_bodyid[geom] == 0 else "#1f5fa8"
-        pen.line(ends, fill=color, width=max(1, round(2 * radius * SCALE)))
-        for px, pz in ends:
-            r = radius * SCALE
-            pen.ellipse((px - r, pz - r, px + r, pz + r), fill=color)
-    pen.text((8, 6), title, fill="#222222")
-    return image
-
-
-def animate(policy, worlds, path):
-    """A GIF of a policy acting in each of the worlds {title: BatchEnv with
-    one environment}, side by side.
-
-    Each world stops moving when its episode ends. Returns the returns reached
-    within MOST steps, by title.
-    """
-    strips, returns = [], {}
-    for title, env in worlds.items():
-        obs, _ = env.reset(seed=0)
-        data, frames, total, ended = mujoco.MjData(env.model), [], 0.0, False
-        for step in range(MOST):
-            if step % EVERY == 0:
-                if not ended:
-                    data.qpos[:] = env.qpos[0]
-                    mujoco.mj_kinematics(env.model, data)
-                x = 0.0 if not env.task.skip_root_x else data.qpos[0]
-                frames.append(
-                    draw(
-                        env.model,
-                        data,
-                        x,
-                        f"{title}: return {total:.0f}{', fallen' if ended else ''}",
-                    )
-                )
-            if not ended:
-                with torch.no_grad():
-                    action = policy.mean(torch.from_numpy(obs.astype(np.float32))).numpy()
-                box = env.single_action_space
-                obs, reward, terminated, truncated, _ = env.step(np.clip(action, box.low, box.high))
-                total, ended = total + float(reward[0]), bool(terminated[0] or truncated[0])
-        strips.append(frames)
-        returns[title] = total
-    frames = []
-    for parts in zip(*strips):
-        frame = Image.new("RGB", (sum(p.width for p in parts), parts[0].height))
-        for i, part in enumerate(parts):
-            frame.paste(part, (i * part.width, 0))
-        frames.append(frame.quantize(64))
-    env = next(iter(worlds.values()))
-    gif = io.BytesIO()
-    frames[0].save(
-        gif,
-        "GIF",
-        save_all=True,
-        append_images=frames[1:],
-        loop=0,
-        duration=max(20, int(1000 * env.dt * EVERY)),
-    )
-    write_whole(path, gif.getvalue())
-    return returns

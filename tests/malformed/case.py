@@ -96,7 +96,7 @@ class Builder:
         self.csv(name, "\n".join(told).encode(), says)
 
     def npz(self, name, says, data=None, **arrays):
-        """An archive of bytes, or of the sound arrays with others in their place (None: without)."""
+        """An archive of bytes, or of the sound arrays but for some (None: without it)."""
         if data is None:
             arrays = {**whole(self.good), **arrays}
             data = archive(**{key: value for key, value in arrays.items() if value is not None})
