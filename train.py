@@ -422,9 +422,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def parse(argv):
-    """The parsed command line: every field of Settings, and what to do with which run.
-
-    Raises RunError where it makes no sense."""
+    """The parsed command line; raises RunError where it makes no sense."""
     parser = Parser(
         prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -466,9 +464,8 @@ def parse(argv):
         given = [name for name in given if name != "grounding_steps"]
     if given and (args.resume or args.replay):
         raise RunError(
-            f"--{given[0].replace('_', '-')} cannot be changed: "
-            "a run goes on in its folder with the settings it began with "
-            "(but for more --grounding-steps); leave it out"
+            f"--{given[0].replace('_', '-')} cannot be changed: a run goes on in its "
+            "folder with the settings it began with (but for more --grounding-steps); leave it out"
         )
     if args.tensorboard and importlib.util.find_spec("tensorboard") is None:
         raise RunError("--tensorboard needs TensorBoard: pip install tensorboard")
