@@ -8,23 +8,16 @@ inlined: the page fetches nothing.
 
 from collections.abc import Iterable
 from functools import cache
-from importlib.resources import files
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from diagnosis.common import pages
 from diagnosis.report import text
 
 
 @cache
 def _environment():
-    environment = Environment(
-        loader=PackageLoader("diagnosis.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = pages.environment("diagnosis.report")
     environment.filters |= {
         "number": text.number,
         "sentence": text.sentence,
@@ -35,12 +28,10 @@ def _environment():
         "pixels": lambda value: f"{value:.1f}",
         "path": path,
     }
-    environment.globals |= {"style": _inlined("style.css"), "script": _inlined("page.js")}
+    inlined = {"style": "style.css", "script": "page.js"}
+    for key, name in inlined.items():
+        environment.globals[key] = pages.inlined("diagnosis.report", name)
     return environment
-
-
-def _inlined(name):
-    return Markup((files("diagnosis.report") / name).read_text(encoding="utf-8"))
 
 
 def render(template: str, **values) -> Markup:

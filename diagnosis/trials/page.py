@@ -8,14 +8,12 @@ Every rate stands with its hits, its trials and its 95 % Wilson interval.
 import json
 import math
 from dataclasses import dataclass
-from importlib.resources import files
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 from scipy.stats import binomtest
 
 from diagnosis.common.atomic_files import write_whole
+from diagnosis.common.pages import environment, inlined
 
 WORSE = 1.01  # times the nominal error: predicts worse
 CLOSE = 1.1  # times the true model's error: as good as it
@@ -295,26 +293,23 @@ def write(tables, out):
     parsed = {name: [parse(row) for row in rows] for name, rows in tables.items()}
     columns = [rates(results) for results in parsed.values()]
     first = next(iter(tables.values()))
-    page = Environment(
-        loader=PackageLoader("diagnosis.trials"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    style = files("diagnosis.trials") / "templates/style.css"
-    text = page.get_template("page.html").render(
-        style=Markup(style.read_text(encoding="utf-8")),
-        count=len(first),
-        settings=first[0]["settings"],
-        versions=", ".join(sorted({row["version"][:12] or "development" for row in first})),
-        names=list(parsed),
-        rates=[
-            (c[0][0], c[0][1], GOALS.get(c[0][1], ""), *(cell[2] for cell in c))
-            for c in zip(*columns)
-        ],
-        breakdowns={name: breakdown(results) for name, results in parsed.items()},
-        failures={name: failures(results) for name, results in parsed.items()},
-        few=FEW,
+    versions = {row["version"][:12] or "development" for rows in tables.values() for row in rows}
+    text = (
+        environment("diagnosis.trials")
+        .get_template("page.html")
+        .render(
+            style=inlined("diagnosis.trials", "templates/style.css"),
+            count=len(first),
+            settings=first[0]["settings"],
+            versions=", ".join(sorted(versions)),
+            names=list(parsed),
+            rates=[
+                (c[0][0], c[0][1], GOALS.get(c[0][1], ""), *(cell[2] for cell in c))
+                for c in zip(*columns)
+            ],
+            breakdowns={name: breakdown(results) for name, results in parsed.items()},
+            failures={name: failures(results) for name, results in parsed.items()},
+            few=FEW,
+        )
     )
     write_whole(out, text.lstrip() + "\n")
