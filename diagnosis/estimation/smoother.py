@@ -169,7 +169,7 @@ class Smoother:
         trajectory; extra velocity variance."""
         model, nv = self.model, self.model.nv
         now = ~self.last
-        q, v, A, B = rows.linearised(qpos[now], qvel[now], force[now], self.scale)
+        q, v, A, B = rows.linearised(qpos[now], qvel[now], force[now], self.scale, free[now])
         n, after = len(q), np.flatnonzero(now) + 1
         with np.errstate(invalid="ignore", over="ignore"):
             drift = np.concatenate(

@@ -162,15 +162,29 @@ class RowMap:
                 )
         return out
 
-    def linearised(self, qpos, qvel, force, scale):
+    def linearised(self, qpos, qvel, force, scale, skipped):
         """What comes out of every row, and its derivatives by forward differences.
 
-        qpos (n, nq), qvel (n, nv), force (n, nv) at the rows of `begin`; scale (nv,): usual forces.
+        qpos (n, nq), qvel (n, nv), force (n, nv) at the rows of `begin`; scale (nv,): usual forces;
+        skipped (n,): rows of which nothing is asked, and NaN told.
         Returns qpos (n, nq), qvel (n, nv), A (n, 2 nv, 2 nv), B (n, 2 nv, nv) in tangent
         coordinates.
         """
-        n, nv, every = len(self.begin), self.model.nv, np.arange(len(self.begin))
-        q, v = self.ahead(every, qpos, qvel, force)
+        n, nv, asked = len(self.begin), self.model.nv, np.flatnonzero(~skipped)
+        out = [
+            np.full(shape, np.nan)
+            for shape in ((n, self.nominal.nq), (n, nv), (n, 2 * nv, 2 * nv), (n, 2 * nv, nv))
+        ]
+        if len(asked):
+            found = self._differences(asked, qpos[asked], qvel[asked], force[asked], scale)
+            for whole, part in zip(out, found):
+                whole[asked] = part
+        return tuple(out)
+
+    def _differences(self, index, qpos, qvel, force, scale):
+        """As linearised(), of rows `index` (n,)."""
+        n, nv = len(index), self.model.nv
+        q, v = self.ahead(index, qpos, qvel, force)
         A, B = np.empty((n, 2 * nv, 2 * nv)), np.empty((n, 2 * nv, nv))
         for d in range(nv):
             unit = np.zeros(nv)
@@ -187,7 +201,7 @@ class RowMap:
                     if which == 0
                     else moved[which] + eps * unit
                 )
-                q1, v1 = self.ahead(every, *moved)
+                q1, v1 = self.ahead(index, *moved)
                 block[:, :nv, k] = difference(self.nominal, q, q1) / eps
                 block[:, nv:, k] = (v1 - v) / eps
         return q, v, A, B

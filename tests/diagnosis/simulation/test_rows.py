@@ -82,7 +82,7 @@ def test_derivatives_are_central_differences_of_stock_steps(xml):
     run = uneven(model, rows=5)
     rows = RowMap(here, [run], {})
     qpos, qvel, force = some_states(model, 4)
-    q, v, A, B = rows.linearised(qpos, qvel, force, np.ones(nv))
+    q, v, A, B = rows.linearised(qpos, qvel, force, np.ones(nv), np.zeros(4, bool))
 
     def moved(k, column, sign):
         state = [qpos[k].copy(), qvel[k].copy(), force[k].copy()]
@@ -100,6 +100,19 @@ def test_derivatives_are_central_differences_of_stock_steps(xml):
             slope = np.concatenate([slope, (up[1] - down[1]) / (2 * small)])
             own = np.concatenate([A[k], B[k]], 1)[:, column]
             np.testing.assert_allclose(own, slope, atol=2e-4 * max(1.0, abs(slope).max()))
+
+
+def test_rows_that_are_skipped_cost_nothing_and_change_no_other():
+    here = World(mujoco.MjSpec.from_string(FREE))
+    rows = RowMap(here, [uneven(here.model, rows=5)], {})
+    state, skipped = some_states(here.model, 4), np.array([False, True, False, True])
+    whole = rows.linearised(*state, np.ones(6), np.zeros(4, bool))
+    asked, ahead = [], rows.ahead
+    rows.ahead = lambda index, *moved: asked.append(index.tolist()) or ahead(index, *moved)
+    for every, some in zip(whole, rows.linearised(*state, np.ones(6), skipped)):
+        np.testing.assert_array_equal(some[~skipped], every[~skipped])
+        assert np.isnan(some[skipped]).all()
+    assert set(map(tuple, asked)) == {(0, 2)}
 
 
 def test_a_constant_push_on_a_body_is_one_in_its_joints():
