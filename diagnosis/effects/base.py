@@ -220,18 +220,6 @@ class Effect:
         """
         return None
 
-    def rubs(self, models, i, values):
-        """As force(), the friction that limit() allows on moving joints: −limit · sign(v). For
-        linear chains, which cannot stick."""
-        limit = self.limit(models, i, values)
-        if limit is None:
-            return None
-
-        def opposing(qpos, qvel, ctrl, time, qfrc_bias):
-            return -limit(qpos, qvel, ctrl, time, qfrc_bias) * np.sign(qvel)
-
-        return opposing
-
     def stepwise(self, model, i):
         """Whether it has to be worked out before each step of a simulation."""
         return self.overrides("force") or self.overrides("limit")

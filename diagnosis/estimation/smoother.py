@@ -33,7 +33,8 @@ class Trajectory:
 
     qpos (rows, nq), qvel (rows, nv); force (rows, nv): what the simulator lacks, mean over the row
     that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free
-    (rows,): where something touches, and no force is told; step: the simulator's, s, 0 if unknown.
+    (rows,): where something touches, and no force is told; transition (rows, 2 nv, 2 nv): to the
+    next row, of small changes; step: the simulator's, s, 0 if unknown.
     """
 
     qpos: np.ndarray
@@ -44,6 +45,7 @@ class Trajectory:
     force_sd: np.ndarray
     first: dict
     free: np.ndarray
+    transition: np.ndarray
     step: float = 0.0
 
     def at(self, windows):
@@ -147,7 +149,9 @@ class Smoother:
             qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
         self.position_noise, self.velocity_noise = self._noise()
         sd = np.split(deviation, 3, axis=1)
-        return Trajectory(qpos, qvel, force, *sd, self.first, free, rows.case.step)
+        transition = np.tile(np.eye(2 * nv), (len(qpos), 1, 1))
+        transition[~self.last] = step[0][:, : 2 * nv, : 2 * nv]
+        return Trajectory(qpos, qvel, force, *sd, self.first, free, transition, rows.case.step)
 
     def _touching(self, qpos):
         """Rows (N,) at or after which something touches; a force there is told by no smooth map."""

@@ -7,6 +7,7 @@ found.fitted.setting; found.trajectory
 from dataclasses import dataclass
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
@@ -54,7 +55,7 @@ class Identification:
         first = trajectory = smoother.locate({})
         self.usual = Usual(self.world, self.train, smoother.scale)
         self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
-        self.screen = self.ahead.sparse()
+        self.screen = Chain(self.world, self.ahead.windows, smoother.position_noise)
         setting, ranking = {}, []
         for i in range(ROUNDS):
             self.ahead.start(trajectory)

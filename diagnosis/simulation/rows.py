@@ -28,7 +28,9 @@ class RowMap:
     begin: the rows (n,) that have a next one, counted through all recordings; seconds (n,).
     """
 
-    def __init__(self, world, recordings, setting):
+    def __init__(self, world, recordings, setting, like=None):
+        """like: another RowMap of the recordings, whose controls are taken over where they are
+        the same."""
         self.world, self.recordings, self.nominal = world, recordings, world.model
         setting = {c: v for c, v in setting.items() if not c.when and not self._adds(c)}
         self.case = case = Case(world.model, setting, 1)
@@ -44,8 +46,19 @@ class RowMap:
         ).astype(int)
         self.seconds = np.concatenate([np.diff(t) for t in time])
         self.count = max(1, int(np.ceil(self.seconds.max() / case.step - SLACK)))
-        self.control = np.concatenate([self._controls(r) for r in recordings])
-        self.activation = self._activations()
+        self.driven = case.step, case.structure, [x for x in case.on if self._drives(x[0])]
+        if like is not None and like.driven == self.driven:
+            self.control, self.activation = like.control, like.activation
+        else:
+            self.control = np.concatenate([self._controls(r) for r in recordings])
+            self.activation = self._activations()
+
+    @staticmethod
+    def _drives(candidate):
+        """Whether an effect may change what the actuators see."""
+        return candidate.place.kind == "actuator" and (
+            candidate.effect.overrides("command") or candidate.effect.overrides("build")
+        )
 
     def _adds(self, candidate):
         """Whether an effect adds coordinates of its own."""
@@ -83,13 +96,20 @@ class RowMap:
 
         Returns qpos (n, nq), qvel (n, nv).
         """
+        held, limit = force + self.forces(index, qpos, qvel), self.limits(index, qpos, qvel)
+        if limit is not None:  # of friction, which at most stops the joint by the end of the row
+            _, free = self._rolled(index, qpos, qvel, held)
+            yields = self.seconds[index, None] * self.model.dof_invweight0
+            held = held - np.clip(free / np.maximum(yields, 1e-12), -limit, limit)
+        return self._rolled(index, qpos, qvel, held)
+
+    def _rolled(self, index, qpos, qvel, force):
         n, m = len(index), self.model
         out_q, out_v = np.empty((n, m.nq)), np.empty((n, m.nv))
-        held = force + self.forces(index, qpos, qvel)
         for a in range(0, n, CHUNK):
             part = slice(a, a + CHUNK)
             out_q[part], out_v[part] = self._rollout(
-                index[part], qpos[part], qvel[part], held[part]
+                index[part], qpos[part], qvel[part], force[part]
             )
         return out_q, out_v
 
@@ -116,28 +136,48 @@ class RowMap:
         v0, v1 = (x[:, 1 + m.nq : 1 + m.nq + m.nv] for x in (here, there))
         return integrate(m, q0, f * difference(m, q0, q1)), v0 + f * (v1 - v0)
 
+    def _stepwise(self, index, qpos, qvel):
+        """(effect, its id, models, values) of the setting's effects that depend on the state, and
+        the arguments of their functions."""
+        n = len(index)
+        time = np.concatenate([r.time[:-1] for r in self.recordings])[index]
+        some = [(c, v, c.effect.id(self.model, c.place.name)) for c, v in self.case.on]
+        some = [
+            (c.effect, i, [self.model] * n, np.tile(np.array(v, float), (n, 1)))
+            for c, v, i in some
+            if c.effect.stepwise(self.model, i)
+        ]
+        return some, (qpos, qvel, self.control[index, 0], time)
+
     def forces(self, index, qpos, qvel):
         """(n, nv): forces of the setting's effects that depend on the state, as at the row's
         beginning."""
-        n, out = len(index), np.zeros((len(index), self.model.nv))
-        xfrc = np.zeros((self.model.nbody, 6))
+        out, xfrc = np.zeros((len(index), self.model.nv)), np.zeros((self.model.nbody, 6))
         constant = np.zeros(self.model.nv)
-        time = np.concatenate([r.time[:-1] for r in self.recordings])
         for c, values in self.case.on:
             i = c.effect.id(self.model, c.place.name)
             c.effect.push(constant, xfrc, self.model, i, values)
-            if not c.effect.stepwise(self.model, i):
-                continue
-            own, models = np.tile(np.array(values, float), (n, 1)), [self.model] * n
-            state = qpos, qvel, self.control[index, 0], time[index]
-            function = c.effect.force(models, i, own)
+        some, state = self._stepwise(index, qpos, qvel)
+        for effect, i, models, values in some:
+            function = effect.force(models, i, values)
             if function is not None:
                 out += function(*state)
-            function = c.effect.rubs(models, i, own)
-            if function is not None:
-                out += function(*state, self._bias(qpos, qvel))
         out += constant
         return out + self._pushed(xfrc, qpos) if xfrc.any() else out
+
+    def limits(self, index, qpos, qvel):
+        """(n, nv): dry friction that the setting's effects add at most, as at the row's beginning;
+        None without such."""
+        some, state = self._stepwise(index, qpos, qvel)
+        some = [each for each in some if each[0].overrides("limit")]
+        if not some:
+            return None
+        out = np.zeros((len(index), self.model.nv))
+        bias = self._bias(qpos, qvel) if any(each[0].loaded for each in some) else out
+        for effect, i, models, values in some:
+            function = effect.limit(models, i, values)
+            out = out + (0.0 if function is None else function(*state, bias))
+        return np.maximum(out, 0.0)
 
     def _bias(self, qpos, qvel):
         """(n, nv): qfrc_bias at states."""

@@ -10,6 +10,7 @@ from plants import PENDULUM, SIZES, START, arm, commanded, pendulum, record, sim
 
 from diagnosis.effects.friction import FrictionCurve, friction_curve
 from diagnosis.simulation.control_signal import Signal
+from diagnosis.simulation.rows import RowMap
 from diagnosis.simulation.simulator import Window, World
 
 ROWS, DT = 100, 0.01
@@ -127,17 +128,19 @@ def test_friction_of_several_joints_and_conditions_at_once():
     assert abs(together[3] - together[0]).max() > 1e-2
 
 
-def test_friction_of_moving_joints_is_a_force_for_linear_chains():
-    world, _ = arm("motors")
-    candidate, rng = world.candidate("load_friction", "elbow"), np.random.default_rng(0)
-    qpos, qvel, bias = (rng.normal(size=(5, 3)) for _ in range(3))
-    ctrl, i = rng.uniform(-3, 3, (5, 3)), candidate.effect.id(world.model, "elbow")
-    values = np.tile(SHARES, (5, 1))
-    force = candidate.effect.rubs([world.model] * 5, i, values)(qpos, qvel, ctrl, np.zeros(5), bias)
-    drive = 0.5 * np.clip(ctrl[:, 2], -4, 4)  # gear times force
-    expected = np.where(drive * qvel[:, 2] >= 0, 0.4, 0.2) * abs(drive + 0.7 * bias[:, 2])
-    np.testing.assert_allclose(force[:, 2], -expected * np.sign(qvel[:, 2]))
-    assert not force[:, :2].any()
+def test_a_row_ahead_knows_friction_that_slides_and_that_holds():
+    """One recorded row from any state, against a simulation that works it out before each step."""
+    world, recording = pendulum(), waves()
+    for name, values in (("load_friction", SHARES), ("friction_map", SIZES["friction_map"])):
+        setting = {world.candidate(name, "j"): values}
+        rows, n = RowMap(world, [recording], setting), ROWS - 1
+        qpos = np.linspace(-1, 1, n)[:, None]
+        for speed in (np.full((n, 1), 0.7), np.full((n, 1), -0.7), np.zeros((n, 1))):
+            windows = [Window(recording, k, k + 1) for k in range(n)]
+            expected = world.simulate([setting] * n, qpos, speed, windows)[1][:, 1]
+            got = rows.ahead(rows.begin, qpos, speed, np.zeros((n, 1)))[1]
+            free = RowMap(world, [recording], {}).ahead(rows.begin, qpos, speed, 0 * qpos)[1]
+            assert np.sqrt(np.mean((got - expected) ** 2)) < 0.06 * abs(free - expected).max()
 
 
 def test_stiffness_and_damping_of_a_servo():

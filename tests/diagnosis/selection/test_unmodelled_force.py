@@ -27,9 +27,9 @@ def made_up(law, noise=0.02, seed=0):
     force = law(q, v, u, time) + noise * rng.normal(size=(ROWS, 2))
     run = Recording("run.csv", time, q, v, u)
     sd = np.full((ROWS, 2), 1e-3)
-    free = np.zeros(ROWS, bool)
+    free, carried = np.zeros(ROWS, bool), np.tile(np.eye(4), (ROWS, 1, 1))
     world = World(mujoco.MjSpec.from_string(ARM))
-    return world, Trajectory(q, v, force, sd, sd, sd, {run: 0}, free), [run]
+    return world, Trajectory(q, v, force, sd, sd, sd, {run: 0}, free, carried), [run]
 
 
 def at(joint, force):

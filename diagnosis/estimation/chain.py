@@ -1,0 +1,112 @@
+"""Predictions along the measured motion: what effects do in every row, carried on by the chain of
+transitions.
+
+chain = Chain(world, windows, noise)
+chain.start(trajectory)
+residual = chain.residual([{}, {friction: (0.1,)}])    # (settings, W, T, nv), as Ahead's
+
+A simulator that lacks much soon leaves the measured motion, and what it would do there says little
+of the machine. So what is missing in each row is compared with what an effect does in the same row
+from the same measured state, and both run on through the same linear transitions: where the effect
+is the missing one they are equal, whatever its size.
+"""
+
+import numpy as np
+
+from diagnosis.estimation import windows as cut
+from diagnosis.estimation.ahead import Ahead
+from diagnosis.simulation.rows import RowMap
+
+
+class Chain(Ahead):
+    """An Ahead whose predictions are linear in what happens in each row. Windows in which something
+    touches, and effects with states or sensors of their own, are simulated as in Ahead."""
+
+    def start(self, trajectory):
+        super().start(trajectory)
+        self.trajectory, self.map = trajectory, None
+        last = np.array([w.last - w.first for w in self.windows])
+        first = np.array([trajectory.first[w.recording] + w.first for w in self.windows])
+        ahead = np.arange(self.known.shape[1])
+        self.rows = first[:, None] + np.minimum(ahead, last[:, None])
+        follows = ahead[:-1] < last[:, None]
+        touched = (trajectory.free[self.rows[:, :-1]] & follows).any(1)
+        self.carried, self.touched = follows & ~touched[:, None], np.flatnonzero(touched)
+        self.used = np.unique(self.rows[:, :-1][self.carried])
+        beside = cut.difference(self.model, trajectory.qpos[self.rows], self.measured)
+        self.beside = np.where(self.known, beside, 0.0)
+        self.whole = self._begun(self.windows)
+        self.contacts = self._begun([self.windows[i] for i in self.touched])
+        self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
+
+    def _begun(self, windows):
+        if not windows:
+            return None
+        ahead = Ahead(self.world, windows, self.noise)
+        ahead.start(self.trajectory)
+        return ahead
+
+    def residual(self, settings, refine=1):
+        """Measured less predicted, (settings, W, T, nv), as of Ahead."""
+        out = np.zeros((len(settings), *self.known.shape))
+        if len(self.used):
+            plain = [{c: v for c, v in s.items() if not self._apart(c)} for s in settings]
+            self._along(plain, out)
+            self._beyond(settings, plain, out)
+        if self.contacts:
+            rest = self.contacts.residual(settings, refine)
+            out[:, self.touched] = 0.0
+            out[:, self.touched, : rest.shape[2]] = rest
+        return out
+
+    def _along(self, settings, out):
+        """Fill in what the chain predicts, the same once."""
+        done = {}
+        for row, setting in zip(out, settings):
+            key = frozenset(setting.items())
+            if key not in done:
+                done[key] = self._grown(self._missing(setting))
+            row[:] = done[key]
+
+    def _beyond(self, settings, plain, out):
+        """Add what effects do that are more than what happens within a row."""
+        more = [k for k, s in enumerate(settings) if len(plain[k]) < len(s)]
+        if not more:
+            return
+        bare = {frozenset(plain[k].items()): plain[k] for k in more}
+        without = dict(zip(bare, self.whole.residual(list(bare.values()))))
+        both = self.whole.residual([settings[k] for k in more])
+        for k, gap in zip(more, both):
+            out[k] += gap - without[frozenset(plain[k].items())]
+
+    def _apart(self, candidate):
+        """Whether an effect is more than what happens within a row."""
+        effect = candidate.effect
+        if candidate.when or effect.overrides("measure") or effect.name == "time_step":
+            return True
+        if not effect.overrides("build"):
+            return False
+        engine = self.world.engine(frozenset([candidate]))
+        return engine.model.nv > self.model.nv or bool(engine.hidden.any())
+
+    def _missing(self, setting):
+        """(used rows, 2 nv): the measured motion less the predicted one, a row on."""
+        t, rows = self.trajectory, self.used
+        self.map = RowMap(self.world, list(t.first), setting, like=self.map)
+        index, none = np.searchsorted(self.map.begin, rows), np.zeros((len(rows), self.model.nv))
+        qpos, qvel = self.map.ahead(index, t.qpos[rows], t.qvel[rows], none)
+        gap = cut.difference(self.model, qpos, t.qpos[rows + 1])
+        return np.concatenate([gap, t.qvel[rows + 1] - qvel], 1)
+
+    def _grown(self, missing):
+        """(W, T, nv): what is missing in the rows as the chain carries it on, and what was measured
+        beside the motion."""
+        (W, T), nv = self.rows.shape, self.model.nv
+        out, x = self.beside.copy(), np.zeros((W, 2 * nv))
+        at = np.searchsorted(self.used, np.minimum(self.rows, self.used[-1]))
+        for t in range(T - 1):
+            step = self.trajectory.transition[self.rows[:, t]]
+            x = (step @ x[..., None])[..., 0] + missing[at[:, t]]
+            x *= self.carried[:, t : t + 1]
+            out[:, t + 1] += np.where(self.known[:, t + 1], x[:, :nv], 0.0)
+        return out

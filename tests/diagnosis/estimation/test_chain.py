@@ -1,0 +1,66 @@
+"""Columns along the measured motion, against the missing force and against the simulator."""
+
+import mujoco
+import numpy as np
+import pytest
+from plants import DRIVEN_PENDULUM, NOISE, recorded
+
+from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.chain import Chain
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.simulation.simulator import World
+
+VISCOUS, DRY = {"viscous_damping": (0.2,)}, {"coulomb_friction": (0.1,)}
+
+
+def located(friction):
+    """(world, setting of the truth, chain at its recordings): a model that lacks its friction."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.0, mass=0.5)))
+    truth = {world.candidate(name, "pivot"): values for name, values in friction.items()}
+    level = friction.get("coulomb_friction", (0.0,))[0]
+    dry = lambda time, q, v: -level * np.tanh(v / 0.02)
+    runs = [recorded(f"{k}.csv", k, damping=0.2, push=dry, seconds=8.0) for k in range(2)]
+    chain = Chain(world, cut_ahead(runs), np.array([NOISE]))
+    chain.start(Smoother(world, runs).locate({}))
+    return world, truth, chain
+
+
+@pytest.fixture(scope="module")
+def here():
+    return located(VISCOUS | DRY)
+
+
+def test_what_the_true_effects_do_in_each_row_is_what_is_missing_whatever_their_size(here):
+    _, truth, chain = here
+    nominal, whole = chain.residual([{}, truth])
+    assert np.sqrt(np.mean(nominal**2)) > 100 * NOISE
+    assert np.sqrt(np.mean(whole**2)) < 0.05 * np.sqrt(np.mean(nominal**2))
+    alone = chain.residual([{c: v} for c, v in truth.items()])
+    apart = sum(nominal - one for one in alone)
+    cosine = np.sum(apart * nominal) / np.sqrt(np.sum(apart**2) * np.sum(nominal**2))
+    assert cosine > 0.999
+
+
+def test_small_changes_are_those_of_the_simulator_where_it_keeps_to_the_motion():
+    """But for dry friction that holds a joint: the chain moves on."""
+    world, truth, chain = located(VISCOUS)
+    close = Chain(world, chain.windows, chain.noise)
+    runs = list(chain.trajectory.first)
+    close.start(Smoother(world, runs).locate(truth))
+    ahead = Ahead(world, chain.windows, chain.noise)
+    ahead.start(close.trajectory)
+    gain = world.candidate("gain", "drive")
+    for candidate, values in ((gain, (1.001,)), (world.candidate("armature", "pivot"), (2e-4,))):
+        some = [truth, {**truth, candidate: values}]
+        (a, b), (c, d) = close.residual(some), ahead.residual(some)
+        x, y = (a - b).ravel(), (c - d).ravel()
+        assert x @ y / np.sqrt((x @ x) * (y @ y)) > 0.999
+
+
+def test_what_is_no_force_is_simulated(here):
+    world, _, chain = here
+    sensor = world.candidate("sensor_scale", "pivot")
+    ahead = Ahead(world, chain.windows, chain.noise)
+    ahead.start(chain.trajectory)
+    along, simulated = (a.residual([{}, {sensor: (1.1,)}]) for a in (chain, ahead))
+    np.testing.assert_allclose(along[1] - along[0], simulated[1] - simulated[0], atol=1e-12)
