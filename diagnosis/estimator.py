@@ -77,7 +77,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         search = Identification(world, transients.calm(train, event), say, log)
         found = search.run()
     say(0.75, "what could stand in a finding's place")
-    fitted, others = rivals.classes(search.candidates, found.judge, found.fitted, log)
+    fitted, others = rivals.classes(search.candidates, found.judge, found.chain, found.fitted, log)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
         fitted = search.pruned(found.judge, fitted)
     say(0.8, "testing for anything left")

@@ -25,8 +25,8 @@ FINALISTS = 4  # sets that the simulator judges in a round
 @dataclass(frozen=True)
 class Found:
     """What the search ended with: fitted, the Fitted set; trajectory and first, smoothed under it
-    and under the nominal model; judge, on the windows begun at that trajectory; ranking:
-    [(candidate, loss removed alone, p-value)], most first."""
+    and under the nominal model; judge, on the windows begun at that trajectory, and chain, along
+    it; ranking: [(candidate, loss removed alone, p-value)], most first."""
 
     fitted: Fitted
     trajectory: object
@@ -34,6 +34,7 @@ class Found:
     smoother: Smoother
     usual: Usual
     judge: Judge
+    chain: Chain
     ranking: list
 
 
@@ -69,9 +70,10 @@ class Identification:
             setting = fitted.setting
             trajectory = smoother.locate(setting, trajectory, passes=1)
         self.ahead.start(trajectory)
+        self.screen.start(trajectory)
         judge = Judge(self.ahead, self.usual, seen=self.seen)
         fitted = judge.fit(setting)
-        return Found(fitted, trajectory, first, smoother, self.usual, judge, ranking)
+        return Found(fitted, trajectory, first, smoother, self.usual, judge, self.screen, ranking)
 
     def _round(self, setting):
         """(Fitted, whether it is better than what there was, first ranking)."""

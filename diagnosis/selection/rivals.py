@@ -1,7 +1,7 @@
 """What could stand in a finding's place: effects whose refits predict as well, told as a class, the
 simplest first.
 
-fitted, others = classes(candidates, judge, fitted)  # others: {candidate: [(other, values), ...]}
+fitted, others = classes(candidates, judge, chain, fitted)  # others: {candidate: [(other, values), ...]}
 """
 
 import numpy as np
@@ -19,14 +19,14 @@ FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
-def classes(candidates, judge, fitted, log=lambda what: None):
+def classes(candidates, judge, chain, fitted, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the simplest member of its class,
     and the other members."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting:
             continue
-        members = _members(candidates, judge, fitted, candidate)
+        members = _members(candidates, judge, chain, fitted, candidate)
         simplest = min(
             [fitted, *(f for f, _ in members if f.loss < fitted.loss + SAME)],
             key=lambda f: (complexity(f.setting), f is not fitted, f.loss),
@@ -44,11 +44,11 @@ def classes(candidates, judge, fitted, log=lambda what: None):
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
 
-def _members(candidates, judge, fitted, candidate):
+def _members(candidates, judge, chain, fitted, candidate):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, best first."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting and c.effect.name != "time_step"]
-    near = _alike(judge, fitted, candidate, pool)
+    near = _alike(judge, chain, fitted, candidate, pool)
     out = []
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
@@ -57,18 +57,17 @@ def _members(candidates, judge, fitted, candidate):
     return sorted(out, key=lambda pair: pair[0].loss)
 
 
-def _alike(judge, fitted, candidate, pool):
+def _alike(judge, chain, fitted, candidate, pool):
     """[(other, values)] with columns like the candidate's force beside the other findings', most
     alike first.
 
     Asked at the model without the finding, for what is gone there is what the others have to
     explain.
     """
-    ahead = judge.ahead
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    columns = Columns(ahead, rest, judge.usual, _near(ahead.world, candidate, pool) + list(rest))
-    gone = columns.residual - fitted.columns.residual
-    evidence = Evidence(ahead, gone, columns.array, fitted.evidence.floor)
+    columns = Columns(chain, rest, judge.usual, _near(chain.world, candidate, pool) + list(rest))
+    gone = columns.residual - chain.residual([fitted.setting])[0]
+    evidence = Evidence(chain, gone, columns.array, fitted.evidence.floor)
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]
     index = [i for k in kept for i in columns.options[k].columns]
     bare = _left(evidence, index)
