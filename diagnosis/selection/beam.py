@@ -5,12 +5,11 @@ start, nodes = Beam(columns, evidence).nodes()
 
 from dataclasses import dataclass
 
-from diagnosis.selection.criterion import Score
+from diagnosis.selection.criterion import PRICE, Score, complexity
 from diagnosis.selection.judge import moved_setting, problem
 
 WIDTH, LOOKS = 5, 10  # sets that are carried on, and further effects tried in each in full
 DEPTH = 4  # effects added in one round
-LEAST = 0.01  # loss that an effect must remove in the first look
 
 
 @dataclass(frozen=True)
@@ -23,7 +22,7 @@ class Node:
 
 
 class Beam:
-    """Looks for sets of options that lower the loss, priors and plausibility included."""
+    """Looks for sets of options that lower the loss, priors and the price of complexity included."""
 
     def __init__(self, columns, evidence):
         self.columns, self.evidence = columns, evidence
@@ -38,7 +37,8 @@ class Beam:
         setting = moved_setting(self.columns, score.amounts, options)
         chosen = [self.columns.options[k] for k in options]
         cost = sum(o.prior.cost(setting[o.candidate]) for o in chosen)
-        return Node(tuple(options), score, score.loss + cost / self.evidence.number)
+        price = PRICE * complexity(o.candidate for o in chosen)
+        return Node(tuple(options), score, score.loss + price + cost / self.evidence.number)
 
     def nodes(self):
         """(node of the model as it is, all nodes met, best first)."""
@@ -53,7 +53,7 @@ class Beam:
                     if key in met:
                         continue
                     met[key] = new = self.node(options)
-                    if new.loss < node.loss - LEAST:
+                    if new.loss < node.loss:
                         grown.append(new)
             if not grown:
                 break

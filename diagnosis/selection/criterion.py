@@ -23,6 +23,8 @@ SHARE = 0.1
 NOISE = 0.3  # of the noise, that counts as none
 GROSS = 5.0  # a window's error over the median, from which on it counts no more
 ITERATIONS = 3  # of reweighted least squares
+FREEDOM = 3  # parameters of an effect that count: those of a curve are smooth
+PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
 PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
 
 
@@ -44,6 +46,13 @@ class Comparison:
     gain: float
     spread: float
     p_value: float
+
+
+def complexity(candidates):
+    """Of a set of effects: how far each is from the first things to think of, and its freedom."""
+    return sum(
+        1 + c.effect.simplicity + (min(len(c.parameters), FREEDOM) - 1) / 2 for c in candidates
+    )
 
 
 def paired(before, after):

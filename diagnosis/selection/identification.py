@@ -11,12 +11,11 @@ from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import Evidence, paired
+from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.judge import Fitted, Judge
 from diagnosis.selection.plausibility import Usual
 
 ROUNDS = 4
-EARNS = 0.1  # nats of log RMS error, summed over channels, that an effect has to remove
 LEVEL = 0.05  # of false additions in all that is looked at
 IDLE = 1.0  # nats that an effect must promise beside those chosen, to be looked at once more
 FINALISTS = 4  # sets that the simulator judges in a round
@@ -118,7 +117,7 @@ class Identification:
         """Nodes for the simulator: the best, and the best of each first effect and each size."""
         chosen, seen = [], set()
         for node in nodes:
-            if node.loss > start.loss - EARNS / 2:
+            if node.loss >= start.loss:
                 break
             names = frozenset(
                 beam.columns.options[k].candidate for k in node.options[len(start.options) :]
@@ -134,8 +133,8 @@ class Identification:
         return chosen
 
     def _choose(self, judged, now, number):
-        """The simplest set that is as good as the best, if that earns its place over what there
-        was."""
+        """The simplest set that is as good as the best within what groups scatter, if that earns
+        its place over what there was."""
         judged = [f for f in judged if f is now or f.settled]
         best = min(judged, key=lambda f: f.loss)
         if best is now or not self.earned(now, best, number):
@@ -143,16 +142,16 @@ class Identification:
 
         def near(fitted):
             step = paired(fitted.score, best.score)
-            return fitted.loss < best.loss + EARNS or step.gain < step.spread
+            return fitted is best or step.gain < step.spread
 
         good = [f for f in judged if f is not now and near(f)]
         return min(good, key=lambda f: (complexity(f.setting), f.loss))
 
     def earned(self, before, after, number=1):
-        """Whether a set removes enough of the loss, and by more than groups scatter, for the number
-        looked at."""
+        """Whether a set is worth its complexity, and better by more than groups scatter, for the
+        number looked at."""
         step = paired(before.score, after.score)
-        return step.gain >= EARNS and step.p_value < LEVEL / number
+        return after.loss < before.loss and step.p_value < LEVEL / number
 
     def pruned(self, judge, fitted):
         """Without the effects that do not earn their place beside the others."""
@@ -179,11 +178,6 @@ class Identification:
             if c not in best or gain > best[c][0]:
                 best[c] = gain, paired(start.score, node.score).p_value
         return sorted(((c, *each) for c, each in best.items()), key=lambda item: -item[1])
-
-
-def complexity(setting):
-    """Parameters of a set, and how far its effects are from the first things to think of."""
-    return sum(len(c.parameters) + 0.5 * c.effect.simplicity for c in setting)
 
 
 def said(setting):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import Evidence, Score
+from diagnosis.selection.criterion import PRICE, Evidence, Score, complexity
 from diagnosis.selection.plausibility import at_limit, plausible, possible
 
 STEPS = 6  # Gauss-Newton steps of a refit, at most
@@ -30,7 +30,8 @@ class Fitted:
 
     @property
     def loss(self):
-        return self.score.loss
+        """With the price of the set's complexity."""
+        return self.score.loss + PRICE * complexity(self.setting)
 
     @property
     def settled(self):

@@ -7,13 +7,12 @@ fitted, others = classes(candidates, judge, chain, fitted)  # others: {candidate
 import numpy as np
 
 from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import Evidence
-from diagnosis.selection.identification import EARNS, complexity
+from diagnosis.selection.criterion import Evidence, complexity
 
 # cosine of two effects' columns beside the other findings', from which on one may stand for the
 # other
 ALIKE = 0.7
-SAME = 0.03  # loss by which the simplest member of a class may be worse than the one found
+TIED = 0.1  # nats of log RMS error by which another member of a class may be worse
 # how much more complex another member of a class may be: three components for one number
 FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
@@ -27,11 +26,9 @@ def classes(candidates, judge, chain, fitted, log=lambda what: None):
         if candidate not in fitted.setting:
             continue
         members = _members(candidates, judge, chain, fitted, candidate)
-        simplest = min(
-            [fitted, *(f for f, _ in members if f.loss < fitted.loss + SAME)],
-            key=lambda f: (complexity(f.setting), f is not fitted, f.loss),
-        )
-        if simplest is not fitted and complexity(simplest.setting) < complexity(fitted.setting):
+        simpler = [f for f, _ in members if complexity(f.setting) < complexity(fitted.setting)]
+        simplest = min([fitted, *simpler], key=lambda f: f.loss)
+        if simplest is not fitted:
             log(f"  simpler in its class: {candidate} -> {list(simplest.setting)[-1]}")
             previous = fitted.setting[candidate]
             fitted, swapped = simplest, True
@@ -52,7 +49,7 @@ def _members(candidates, judge, chain, fitted, candidate):
     out = []
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
-        if tried.settled and tried.loss < fitted.loss + EARNS:
+        if tried.settled and tried.score.loss < fitted.score.loss + TIED:
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
@@ -91,12 +88,12 @@ def _alike(judge, chain, fitted, candidate, pool):
 def _near(world, candidate, pool):
     """Candidates of a pool that act where a finding does, or everywhere."""
     mine = world.joints(candidate.place)
-    most = len(candidate.parameters) + candidate.effect.simplicity / 2 + FURTHER
+    most = complexity([candidate]) + FURTHER
     related = set(world.related(candidate))
     out = []
     for other in pool:
         theirs = world.joints(other.place)
-        if len(other.parameters) + other.effect.simplicity / 2 > most:
+        if complexity([other]) > most:
             continue
         if other in related or mine is None or theirs is None or mine & theirs:
             out.append(other)

@@ -22,8 +22,8 @@ SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per seco
 class RowMap:
     """Simulates every row of some recordings under a setting, with a constant extra force in each.
 
-    Effects that add coordinates of their own (backlash) or act under a condition are left out: a
-    row knows the nominal model's coordinates alone.
+    Effects that add coordinates (backlash) or states (bristles) of their own or act under a
+    condition are left out: a row knows the nominal model's coordinates alone.
 
     begin: the rows (n,) that have a next one, counted through all recordings; seconds (n,).
     """
@@ -61,10 +61,11 @@ class RowMap:
         )
 
     def _adds(self, candidate):
-        """Whether an effect adds coordinates of its own."""
+        """Whether an effect adds coordinates or states of its own."""
         if not candidate.effect.overrides("build"):
             return False
-        return self.world.engine(frozenset([candidate])).model.nv > self.nominal.nv
+        engine = self.world.engine(frozenset([candidate]))
+        return engine.model.nv > self.nominal.nv or bool(engine.hidden.any())
 
     def _controls(self, recording):
         """(rows - 1, count, nu): what the actuators see in the steps after each row."""

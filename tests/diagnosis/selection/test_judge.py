@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.selection import rivals
@@ -46,6 +47,14 @@ def judge_of(**hidden):
     ahead = Ahead(world, cut_ahead(runs), smoother.position_noise)
     ahead.start(trajectory)
     return Judge(ahead, Usual(world, runs, smoother.scale))
+
+
+def along(judge):
+    """The Chain along the motion of a Judge's recordings."""
+    ahead = judge.ahead
+    chain = Chain(ahead.world, ahead.windows, ahead.noise)
+    chain.start(Smoother(ahead.world, judge.usual.recordings).locate({}))
+    return chain
 
 
 def test_friction_and_gain_are_recovered_from_afar():
@@ -90,7 +99,7 @@ def test_back_emf_and_viscous_damping_are_one_class():
     pool = [c for c in world.candidates if c.effect.name in names]
     for found in (damping, back_emf):
         fitted = judge.fit({found: (0.1,)})
-        again, others = rivals.classes(pool, judge, fitted)
+        again, others = rivals.classes(pool, judge, along(judge), fitted)
         [named] = again.setting
         told = {named, *(c for c, _ in others[named])}
         assert {damping, back_emf} <= told
@@ -107,6 +116,6 @@ def test_what_is_no_equal_is_not_told():
     fitted = judge.fit({friction: (0.05,)})
     others = "gain", "stiffness", "mass", "delay", "viscous_damping", "gravity", "bias"
     pool = [c for c in world.candidates if c.effect.name in others]
-    again, told = rivals.classes(pool, judge, fitted)
+    again, told = rivals.classes(pool, judge, along(judge), fitted)
     assert list(again.setting) == [friction]
     assert told[friction] == []
