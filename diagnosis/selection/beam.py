@@ -22,7 +22,7 @@ class Node:
 
 
 class Beam:
-    """Looks for sets of options that lower the loss, priors and the price of complexity included."""
+    """Looks for sets of options that lower the loss, with priors and the price of complexity."""
 
     def __init__(self, columns, evidence):
         self.columns, self.evidence = columns, evidence

@@ -1,7 +1,8 @@
 """What could stand in a finding's place: effects whose refits predict as well, told as a class, the
 simplest first.
 
-fitted, others = classes(candidates, judge, chain, fitted)  # others: {candidate: [(other, values), ...]}
+fitted, others = classes(candidates, judge, chain, fitted)
+others[candidate]                                    # [(other, values), ...]
 """
 
 import numpy as np
