@@ -60,7 +60,7 @@ def without_step(fitted, index):
     every = np.arange(p + 2)
     wide, amounts = half_widths(evidence, every)
     weight = evidence.weight(every, np.zeros(p + 1))
-    whole = np.einsum("gc,gcij->ij", weight, evidence.gram)[1:, 1:]
+    whole = np.einsum("gc,gcij->ij", weight, evidence.products(every))[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     even = whole / np.outer(scale, scale)
     inside = even[:p, :p] + UNSEEN * np.eye(p)
@@ -80,7 +80,7 @@ def half_widths(evidence, index):
     if not p:
         return np.zeros(0), np.zeros(0)
     weight = evidence.weight(index, np.zeros(p))
-    each = np.einsum("gc,gcij->gij", weight, evidence.gram[:, :, index][..., index])
+    each = np.einsum("gc,gcij->gij", weight, evidence.products(index))
     scale = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], 1e-300))
     gram, score = each[:, 1:, 1:] / np.outer(scale, scale), each[:, 1:, 0] / scale
     whole = gram.sum(0)
@@ -118,7 +118,7 @@ def _curvature(evidence, index, weight, root):
     The log of a cell's square bends less than the square itself, for a cell that errs much counts
     less: 1/2 log s has the second derivative X'X / ns - 2 X'r r'X / (ns)^2.
     """
-    score = evidence.gram[:, :, 0][..., index[1:]] @ root
+    score = evidence.products(index)[:, :, 0, 1:] @ root
     less = np.einsum("gc,gci,gcj->ij", 2 * weight**2, score, score)
     values, vectors = np.linalg.eigh(np.eye(len(root)) - less)
     return (vectors * np.clip(values, FLAT, None)) @ vectors.T

@@ -75,11 +75,9 @@ class Evidence:
         groups, bands = ahead.group.max() + 1, range(ahead.band.max() + 1)
         stack = np.concatenate([residual[..., None], columns], -1)
         cells = [(dofs, b) for dofs in ahead.channels for b in bands]
-        K = stack.shape[-1]
-        self.gram = np.zeros((groups, len(cells), K, K))
         self.count = np.zeros((groups, len(cells)))
         self.channels = len(ahead.channels)
-        least = np.zeros(len(cells))
+        least, rows = np.zeros(len(cells)), {}
         for j, (dofs, b) in enumerate(cells):
             inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
             noise = np.where(np.isfinite(ahead.noise[dofs]), ahead.noise[dofs], 0.0)
@@ -90,10 +88,12 @@ class Evidence:
                 if not len(w):
                     continue
                 part, here = stack[w][:, :, dofs], inside[w]
-                rows = part[here] * np.repeat(np.sqrt(weight[w]), here.sum((1, 2)))[:, None]
-                self.gram[g, j], self.count[g, j] = rows.T @ rows, len(rows)
+                root = np.repeat(np.sqrt(weight[w]), here.sum((1, 2)))
+                rows[g, j] = part[here] * root[:, None]
+                self.count[g, j] = len(root)
+        self._keep(rows, stack.shape[-1])
         self.cells = (self.count > 0).any(0)
-        square = self.gram[:, :, 0, 0] / np.maximum(self.count, 1)
+        square = self.own[:, :, 0] / np.maximum(self.count, 1)
         self.floor = reference
         if reference is None:
             middle = [
@@ -103,10 +103,43 @@ class Evidence:
             self.floor = np.tile(least + SHARE**2 * np.array(middle) + 1e-30, (groups, 1))
         self.number = max(self.cells.sum() * groups / max(self.channels, 1), 1)  # cells per channel
 
-    def _square(self, index, amounts):
-        """Mean squared error (G, cells) of amounts (p,) or (G, p) of columns `index`."""
+    def _keep(self, rows, width):
+        """Keep weighted rows {(group, cell): (n, width)}, columns first, and their squares.
+
+        Products of all columns with all would take the square of their number: those asked for are
+        worked out when they are.
+        """
+        where = sorted(rows)
+        self.columns = np.empty((width, sum(len(rows[k]) for k in where)))
+        self.cell = np.repeat(
+            np.array([g * self.count.shape[1] + j for g, j in where], int),
+            [len(rows[k]) for k in where],
+        )
+        self.first = np.flatnonzero(np.diff(self.cell, prepend=-1))
+        for k, a in zip(where, self.first):
+            self.columns[:, a : a + len(rows[k])] = rows[k].T
+        self.own = np.stack([self._sums(c * c) for c in self.columns], -1)
+
+    def _sums(self, product):
+        """(G, cells) of a product of columns (N,)."""
+        out = np.zeros(self.count.size)
+        if len(product):
+            out[self.cell[self.first]] = np.add.reduceat(product, self.first)
+        return out.reshape(self.count.shape)
+
+    def products(self, index):
+        """(G, cells, p, p): sums of products of columns index (p,), 0 being the residual."""
+        chosen = self.columns[index]
+        out = np.empty((*self.count.shape, len(index), len(index)))
+        for i, a in enumerate(chosen):
+            out[:, :, i, i] = self.own[:, :, index[i]]
+            for j in range(i):
+                out[:, :, i, j] = out[:, :, j, i] = self._sums(a * chosen[j])
+        return out
+
+    def _square(self, g, amounts):
+        """Mean squared error (G, cells) of amounts (p,) or (G, p), from products() g."""
         z = np.concatenate([np.ones((*amounts.shape[:-1], 1)), -amounts], -1)
-        g = self.gram[:, :, index][..., index]
         z = np.broadcast_to(z, (len(g), z.shape[-1]))
         square = np.einsum("gi,gcij,gj->gc", z, g, z, optimize=PAIRS)
         return np.maximum(square, 0.0) / np.maximum(self.count, 1)
@@ -123,26 +156,26 @@ class Evidence:
         quadratic prior, precision/2 amount² - pull amount, in nats.
         """
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
-        p, amounts = len(index) - 1, np.zeros(len(index) - 1)
+        p, amounts, g = len(index) - 1, np.zeros(len(index) - 1), self.products(index)
         if not p:
-            groups = self.losses(self._square(index, amounts))
+            groups = self.losses(self._square(g, amounts))
             return Score(float(groups.mean()), groups, amounts)
-        g = self.gram[:, :, index][..., index]
         for _ in range(ITERATIONS):
-            weight = self.weight(index, amounts)
-            each = np.einsum("gc,gcij->gij", weight, g)
+            each = np.einsum("gc,gcij->gij", self._weight(g, amounts), g)
             whole = each.sum(0)
             amounts = bounded(whole[1:, 1:] + np.diag(precision), whole[1:, 0] + pull, low, high)
-        weight = self.weight(index, amounts)
-        each = np.einsum("gc,gcij->gij", weight, g)
+        each = np.einsum("gc,gcij->gij", self._weight(g, amounts), g)
         rest = each.sum(0) - each
         left = each_bounded(rest[:, 1:, 1:] + np.diag(precision), rest[:, 1:, 0] + pull, low, high)
-        groups = self.losses(self._square(index, left))
+        groups = self.losses(self._square(g, left))
         return Score(float(groups.mean()), groups, amounts)
 
     def weight(self, index, amounts):
         """(G, cells): weights of squares at which least squares lowers the sum of logs."""
-        square = self._square(index, amounts)
+        return self._weight(self.products(index), amounts)
+
+    def _weight(self, g, amounts):
+        square = self._square(g, amounts)
         return np.where(
             self.count > 0, 1 / (np.maximum(self.count, 1) * (square + self.floor)), 0.0
         )
@@ -152,14 +185,15 @@ class Evidence:
         look."""
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
         weight = self.weight(index, np.asarray(amounts, float))
-        whole = np.einsum("gc,gcij->ij", weight, self.gram, optimize=True)
-        inside = whole[np.ix_(index[1:], index[1:])] + np.diag(precision)
-        score = whole[1:, 0] - whole[1:, index[1:]] @ amounts
-        curve = np.diag(whole)[1:].copy()
+        beside = self.columns @ (self.columns[index] * weight.ravel()[self.cell]).T
+        own = np.einsum("gc,gck->k", weight, self.own)[1:]
+        inside = beside[index[1:], 1:] + np.diag(precision)
+        score = beside[1:, 0] - beside[1:, 1:] @ amounts
+        curve = own.copy()
         if len(index) > 1:
-            cross = whole[1:, index[1:]]
+            cross = beside[1:, 1:]
             curve -= (cross * np.linalg.solve(inside, cross.T).T).sum(1)
-        seen = curve > 1e-9 * np.maximum(np.diag(whole)[1:], 1e-300)
+        seen = curve > 1e-9 * np.maximum(own, 1e-300)
         return np.where(seen, score**2 / np.where(seen, curve, 1.0) / 2, 0.0)
 
 

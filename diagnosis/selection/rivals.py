@@ -105,7 +105,7 @@ def _left(evidence, columns):
     """Weighted squares that columns leave of what is gone."""
     index = np.concatenate([[0], np.asarray(columns, int) + 1]).astype(int)
     weight = evidence.weight(np.array([0]), np.zeros(0))
-    whole = np.einsum("gc,gcij->ij", weight, evidence.gram[:, :, index][..., index])
+    whole = np.einsum("gc,gcij->ij", weight, evidence.products(index))
     if len(index) == 1:
         return whole[0, 0]
     inside = whole[1:, 1:] + 1e-9 * np.diag(np.diag(whole)[1:])
