@@ -1,7 +1,6 @@
 """The example of the README: the demo's recordings diagnosed, as a table and as a picture.
 
-python benchmarks/demo.py      # results/demo.csv and, where a Chromium is installed,
-docs/report.png
+python benchmarks/demo.py  # results/demo.csv and, with a Chromium, docs/report.png
 """
 
 import contextlib

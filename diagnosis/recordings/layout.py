@@ -34,9 +34,8 @@ class Raw(NamedTuple):
     """One run as its file has it.
 
     label: for messages; name: of the recording; columns: {the file's own name: (T,) float64};
-    natural: {our name: the
-    file's own}, as its format implies; first_row: what the file's own reader calls the row of
-    columns[...][0]; notes.
+    natural: {our name: the file's own}, as its format implies; first_row: what the file's own
+    reader calls the row of columns[...][0]; notes.
     """
 
     label: str

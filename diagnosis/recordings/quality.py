@@ -44,12 +44,10 @@ class Quality:
     """What was done to one recording.
 
     quantum: {column: step, its unit}, of positions whose readings are whole numbers of it;
-    differenced: {joint:
-    Differenced}; period: s between rows, usually; jitter: s, standard deviation of the stamps
-    about an even grid; even: the
-    rows were taken evenly although their stamps jitter; skipped: share of rows left out;
-    rows_from: s between the rows
-    from which these were interpolated, None where they are as they were taken.
+    differenced: {joint: Differenced}; period: s between rows, usually; jitter: s, standard
+    deviation of the stamps about an even grid; even: the rows were taken evenly although their
+    stamps jitter; skipped: share of rows left out; rows_from: s between the rows from which these
+    were interpolated, None where they are as they were taken.
     """
 
     quantum: Mapping[str, float] = field(default_factory=dict)

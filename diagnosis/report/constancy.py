@@ -28,11 +28,9 @@ class Row:
     """One parameter over R recordings.
 
     name; recordings: their names; values, errors (R,): NaN where a recording does not show it;
-    pooled, pooled_error: weighted
-    mean, its standard error widened where the values scatter more than theirs; p: of constancy;
-    scatter: standard deviation
-    between recordings beyond their errors; along: (variable, slope, p) that the values go along
-    with, or None.
+    pooled, pooled_error: weighted mean, its standard error widened where the values scatter more
+    than theirs; p: of constancy; scatter: standard deviation between recordings beyond their
+    errors; along: (variable, slope, p) that the values go along with, or None.
     """
 
     name: str

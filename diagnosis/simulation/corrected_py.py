@@ -1,12 +1,11 @@
 """corrected.py: a script beside corrected.xml that adds what MJCF cannot hold, with numpy and
 mujoco alone.
 
-parts = python_parts(world.model, setting)              # [] where corrected.xml alone holds the
-setting
-write_corrected_py("report/corrected.py", "report/corrected.xml", parts, joints)
-rows = predictions("report/corrected.py", windows, world.model)      # in a process of its own
-step = module_of(parts, joints).step                    # step(model, data, nstep) in this process
-batch = CorrectedBatch(model, 64, parts=parts)          # many environments at once, for training
+    parts = python_parts(world.model, setting)      # [] where corrected.xml alone holds it
+    write_corrected_py("report/corrected.py", "report/corrected.xml", parts, joints)
+    rows = predictions("report/corrected.py", windows, world.model)  # in a process of its own
+    step = module_of(parts, joints).step            # step(model, data, nstep) in this process
+    batch = CorrectedBatch(model, 64, parts=parts)  # many environments at once, for training
 
 The script is diagnosis/simulation/corrected_template.py with the laws that are needed, and the
 numbers.

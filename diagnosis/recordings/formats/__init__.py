@@ -3,10 +3,8 @@
     for raw in read("run.csv", model, Layout()): ...
 
 CSV, NPZ, ROS 2 bags, LeRobot datasets, PACE dictionaries and Minari datasets. Those that need a
-library of their own name
-it where it is not installed. Nothing is ever unpickled. Every fault raises RecordingError with one
-line: file, row,
-column, and what to do.
+library of their own name it where it is not installed. Nothing is ever unpickled. Every fault
+raises RecordingError with one line: file, row, column, and what to do.
 """
 
 import glob
