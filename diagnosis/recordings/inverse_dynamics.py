@@ -98,14 +98,12 @@ def residuals(diagnosis, most=1200):
     for index, finding in enumerate(diagnosis.summary["findings"]):
         held = after if finding["written_as"] == "mjcf" else np.full_like(after, np.nan)
         for variable in finding["depends_on"][:2]:
-            x, joint, unit = _variable(nominal, variable, time, qpos, qvel, ctrl)
+            x, joint, unit = course_of(nominal, variable, time, qpos, qvel, ctrl)
             joint = _joint_of(nominal, finding["place"], joint)
             if x is None or joint is None:
                 continue
-            hinge, dof = (
-                nominal.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE,
-                nominal.jnt_dofadr[joint],
-            )
+            hinge = nominal.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+            dof = nominal.jnt_dofadr[joint]
             found.append(
                 {
                     "finding": index,
@@ -121,7 +119,7 @@ def residuals(diagnosis, most=1200):
     return found
 
 
-def _variable(model, variable, time, qpos, qvel, ctrl):
+def course_of(model, variable, time, qpos, qvel, ctrl):
     """(values (n,), joint id or None, unit) of "velocity:elbow", "control:motor", "time"; values
     None where unknown."""
     kind, _, name = variable.partition(":")
@@ -132,11 +130,9 @@ def _variable(model, variable, time, qpos, qvel, ctrl):
         if joint >= 0 and model.jnt_type[joint] in (HINGE, SLIDE):
             length = "rad" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE else "m"
             q, v = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-            return (
-                (qpos[:, q], joint, length)
-                if kind == "position"
-                else (qvel[:, v], joint, length + "/s")
-            )
+            if kind == "position":
+                return qpos[:, q], joint, length
+            return qvel[:, v], joint, length + "/s"
     if kind == "control":
         actuator = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
         if actuator >= 0 and model.actuator_ctrlnum[actuator]:

@@ -3,13 +3,14 @@
     summary = with_each_recording(world, settings, recordings, summary)
 
 From the values of all, one step of Gauss and Newton towards what each recording alone asks for, all
-parameters together, on windows of WINDOW seconds. What another start position and velocity of a
-window would change is left out of the comparison, to first order. Errors come from the scatter
+parameters together, on windows of WINDOW seconds, begun where they themselves ask for it. What
+another start would change is left out of the comparison, to first order. Errors come from the scatter
 between windows, so that they hold for motion that no finding explains, too.
 """
 
 import numpy as np
 
+from diagnosis.common.distributions import t_ppf
 from diagnosis.recordings.columns import WIDTHS
 from diagnosis.report.constancy import between_runs, constancy, table, words
 from diagnosis.report.text import UNSTEADY
@@ -19,7 +20,7 @@ WINDOW = 0.4  # s
 MOST, LEAST = 80, 6  # windows in all; of one recording, below which it says nothing by itself
 STEP = 0.02  # of a value, or of its parameter's own step where that is more
 MOVE = 3.0  # noises, by which starts are moved
-UNSEEN = 3.0  # standard errors over the value itself, above which a recording does not show it
+UNSEEN = 3.0  # its error over the value of all, above which a recording does not show it
 
 
 def with_each_recording(world, settings: dict, recordings: list, summary: dict) -> dict:
@@ -35,7 +36,7 @@ def with_each_recording(world, settings: dict, recordings: list, summary: dict) 
     names = [r.name for r in recordings]
     findings = []
     for finding in summary["findings"]:
-        entries, p = _entries(finding, found, names)
+        entries, p = _entries(finding, found, names, known)
         more = {"per_recording": entries, "constancy": p} if entries else {}
         findings.append({**finding, **more})
     labelled = {
@@ -46,7 +47,7 @@ def with_each_recording(world, settings: dict, recordings: list, summary: dict) 
     return {**summary, "findings": findings, "warnings": summary.get("warnings", []) + told}
 
 
-def _entries(finding, found, names):
+def _entries(finding, found, names, settings):
     """(rows of per_recording, p of constancy: the smallest of its parameters') of one finding."""
     rows, p = [], []
     for (candidate, k), (values, errors) in found.items():
@@ -58,7 +59,8 @@ def _entries(finding, found, names):
             continue
         p.append(constancy(values, errors))
         for name, value, error in zip(names, values, errors):
-            shown = np.isfinite(value) and error < UNSEEN * abs(value)
+            size = max(abs(settings[candidate][k]), abs(value) - 2 * error)
+            shown = np.isfinite(value) and error < UNSEEN * size
             rows.append(
                 {
                     "recording": name,
@@ -110,38 +112,71 @@ def _cases(settings):
 
 def _compared(world, recording, cases, noise, most):
     """(residual (W, N), slopes (W, N, P)) of windows of a recording, in noises, 0 where unknown,
-    without what another start of each window would change."""
-    model, single = world.model, [j for j in range(world.model.njnt) if _single(world.model, j)]
-    q, v = ([int(a[j]) for j in single] for a in (model.jnt_qposadr, model.jnt_dofadr))
+    without what another start of each window would change.
+
+    The starts are first moved to where each window asks for them. Where friction turns depends on
+    them, and the slopes at a start as noisy as the recording do not tell how."""
     windows, qpos, qvel = _windows(recording, most)
-    if not windows:
+    if not windows or not _sizes(world.model, noise):
         return np.zeros((0, 0)), np.zeros((0, 0, 0))
-    size = np.array([noise.get(f"qpos:{model.joint(j).name}") or np.inf for j in single])
-    step = 1.0 / np.median(np.diff(recording.time))
-    moves = [(n, MOVE * size[k], 0.0) for k, n in enumerate(q) if np.isfinite(size[k])]
-    moves += [(n, 0.0, MOVE * size[k] * step) for k, n in enumerate(v) if np.isfinite(size[k])]
-    starts = [(qpos, qvel)] * len(cases)
-    for n, dq, dv in moves:
-        moved = qpos.copy(), qvel.copy()
-        moved[0 if dq else 1][:, n] += dq or dv
-        starts.append(moved)
-    settings = [setting for setting, _ in cases] + [cases[0][0]] * len(moves)
-    told, _ = world.simulate(
+    seen = np.stack([recording.qpos[w.first : w.last + 1] for w in windows])
+    moves = _moves(world.model, noise, np.median(np.diff(recording.time)))
+    settings = [setting for setting, _ in cases]
+    told = _told(world, settings[:1], windows, (qpos, qvel), moves)
+    residual, slopes = _gaps(world.model, noise, told, seen)
+    amounts = np.clip((np.linalg.pinv(slopes) @ residual[..., None])[..., 0], -1.0, 1.0)
+    for amount, (dq, dv) in zip(amounts.T, moves):
+        qpos, qvel = qpos + np.outer(amount, dq), qvel + np.outer(amount, dv)
+    told = _told(world, settings, windows, (qpos, qvel), moves)
+    fine = np.isfinite(told).all(axis=(0, 2, 3))
+    residual, slopes = _gaps(world.model, noise, told[:, fine], seen[fine])
+    slopes, starts = np.split(slopes, [len(cases) - 1], axis=2)
+    basis = np.linalg.qr(starts)[0]
+    rest = lambda x: x - basis @ (np.swapaxes(basis, 1, 2) @ x)
+    return rest(residual[..., None])[..., 0], rest(slopes)
+
+
+def _moves(model, noise, step):
+    """[(nq,), (nv,)] by which starts are moved: each joint's position by MOVE noises, then each
+    one's velocity by as many a row of `step` seconds."""
+    moves = []
+    for j, size in _sizes(model, noise):
+        moves.append((MOVE * size * np.eye(model.nq)[model.jnt_qposadr[j]], np.zeros(model.nv)))
+    for j, size in _sizes(model, noise):
+        speed = MOVE * size / step
+        moves.append((np.zeros(model.nq), speed * np.eye(model.nv)[model.jnt_dofadr[j]]))
+    return moves
+
+
+def _sizes(model, noise):
+    """[(joint, noise)] of the joints of one coordinate that were measured."""
+    names = {j: f"qpos:{model.joint(j).name}" for j in range(model.njnt) if _single(model, j)}
+    return [(j, noise[name]) for j, name in names.items() if noise.get(name)]
+
+
+def _told(world, settings, windows, starts, moves):
+    """(S + M, W, T, nq) of the windows under each setting, and under the first from starts that
+    each of M moves has moved."""
+    begun = [starts] * len(settings) + [(starts[0] + dq, starts[1] + dv) for dq, dv in moves]
+    settings = [*settings, *settings[:1] * len(moves)]
+    qpos, _ = world.simulate(
         [setting for setting in settings for _ in windows],
-        *(np.concatenate(some) for some in zip(*starts)),
+        *(np.concatenate(some) for some in zip(*begun)),
         windows * len(settings),
     )
-    told = told[..., q].reshape(len(settings), len(windows), -1, len(q))
-    seen = np.stack([recording.qpos[w.first : w.last + 1][:, q] for w in windows])
-    fine = np.isfinite(told).all(axis=(0, 2, 3))
-    parts = np.concatenate([seen[None] - told[:1], told[1:] - told[:1]])[:, fine] / size
-    parts = np.nan_to_num(np.where(np.isnan(seen[fine]), 0.0, parts)).reshape(
-        len(settings), fine.sum(), -1
-    )
-    basis = np.linalg.qr(np.moveaxis(parts[len(cases) :], 0, -1))[0]
-    kept = parts[: len(cases)]
-    kept = kept - np.einsum("wtk,wsk,cws->cwt", basis, basis, kept)
-    return kept[0], np.moveaxis(kept[1:], 0, -1)
+    return qpos.reshape(len(settings), len(windows), -1, world.model.nq)
+
+
+def _gaps(model, noise, told, seen):
+    """(residual (W, N), slopes (W, N, P)) in noises: what was seen (W, T, nq) beyond told[0], and
+    each further one of told (1 + P, W, T, nq) beyond it; 0 where nothing was measured."""
+    joints, sizes = zip(*_sizes(model, noise))
+    column = model.jnt_qposadr[list(joints)]
+    seen, told = seen[..., column], told[..., column]
+    parts = np.concatenate([seen[None] - told[:1], told[1:] - told[:1]]) / sizes
+    parts = np.where(np.isfinite(parts), parts, 0.0)
+    parts = parts.reshape(len(told), len(seen), -1)
+    return parts[0], np.moveaxis(parts[1:], 0, -1)
 
 
 def _single(model, j):
@@ -172,8 +207,8 @@ def _start(recording, row):
 
 
 def _step(residual, slopes):
-    """(change (P,), standard error (P,)) in steps: least squares, and the jackknife over
-    windows."""
+    """(change (P,), standard error (P,)) in steps: least squares, and the jackknife over windows,
+    widened as Student's t asks for so few."""
     grams = np.einsum("wnp,wnq->wpq", slopes, slopes)
     scores = np.einsum("wnp,wn->wp", slopes, residual)
 
@@ -184,4 +219,4 @@ def _step(residual, slopes):
     without = np.array([solved(gram - g, score - s) for g, s in zip(grams, scores)])
     count = len(residual)
     spread = (count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0)
-    return solved(gram, score), np.sqrt(spread)
+    return solved(gram, score), np.sqrt(spread) * t_ppf(0.975, count - 1) / 1.96

@@ -11,7 +11,7 @@ from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.noise import difference_noise, measurement_noise
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings import recording
-from diagnosis.recordings.inverse_dynamics import _variable
+from diagnosis.recordings.inverse_dynamics import course_of
 from diagnosis.simulation.simulator import World
 
 FRAMES = """<mujoco><worldbody>
@@ -125,7 +125,7 @@ def test_controls_of_actuators_after_a_passive_one():
     )
     model, ctrl = mujoco.MjModel.from_xml_string(passive), np.arange(3.0)[:, None]
     assert model.nactuator == 2 and model.nu == 1
-    values, *_ = _variable(model, "control:pull", None, None, None, ctrl)
+    values, *_ = course_of(model, "control:pull", None, None, None, ctrl)
     assert (values == ctrl[:, 0]).all()
 
 

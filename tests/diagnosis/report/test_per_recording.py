@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from arm import ARM
 
+from diagnosis import demo
 from diagnosis.nominal.model import load_world
 from diagnosis.recordings.recording import Recording
+from diagnosis.report.constancy import constancy
 from diagnosis.report.per_recording import estimates, with_each_recording
 
 STIFF = 'solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"'
@@ -92,3 +94,22 @@ def test_what_a_recording_does_not_show_is_null(world):
     alone = with_each_recording(world, settings(world), runs[:1], summary())
     assert "per_recording" not in alone["findings"][0]
     assert with_each_recording(world, {}, runs, summary()) == summary()
+
+
+def test_noisy_starts_shift_no_recordings_value():
+    """Three runs of the demo, in which friction turns: each one's values lie about the truth, by
+    their own errors."""
+    world = load_world(mujoco.MjSpec.from_string(demo.ARM))
+    runs = []
+    for seed in (1, 2, 4):
+        rows = demo.run(demo.real_arm(), seed)
+        unmeasured = np.full((len(rows), 2), np.nan)
+        runs.append(Recording(f"run{seed}", rows[:, 0], rows[:, 1:3], unmeasured, rows[:, 3:]))
+    truth = {
+        world.candidate("coulomb_friction", "elbow"): (demo.HIDDEN["elbow friction"],),
+        world.candidate("mass", "forearm"): (demo.HIDDEN["forearm mass"],),
+    }
+    noise = dict.fromkeys(("qpos:shoulder", "qpos:elbow"), demo.NOISE)
+    for (candidate, k), (values, errors) in estimates(world, truth, runs, noise).items():
+        assert (abs(values - truth[candidate][k]) < 4 * errors).all()
+        assert constancy(values, errors) > 0.01
