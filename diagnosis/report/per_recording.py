@@ -4,8 +4,8 @@
 
 From the values of all, one step of Gauss and Newton towards what each recording alone asks for, all
 parameters together, on windows of WINDOW seconds, begun where they themselves ask for it. What
-another start would change is left out of the comparison, to first order. Errors come from the scatter
-between windows, so that they hold for motion that no finding explains, too.
+another start would change is left out of the comparison, to first order. Errors come from the
+scatter between windows, so that they hold for motion that no finding explains, too.
 """
 
 import numpy as np

@@ -121,8 +121,8 @@ name="j" axis="0 1 0" damping="0.3"/>
 
 def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
     """A servo that integrates its control: stock MuJoCo's record of the nominal model itself,
-    without noise. Its target at the cut is that of the rows before, so the nominal model predicts the
-    tail; from a target of 0 it misses by far."""
+    without noise. Its target at the cut is that of the rows before, so the nominal model predicts
+    the tail; from a target of 0 it misses by far."""
     model = mujoco.MjModel.from_xml_string(INTEGRATOR)
     data, rows = mujoco.MjData(model), []
     for _ in range(300):
