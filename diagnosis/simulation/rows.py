@@ -45,7 +45,9 @@ class RowMap:
             [np.arange(a, b - 1) for a, b in zip(first[:-1], first[1:])]
         ).astype(int)
         self.seconds = np.concatenate([np.diff(t) for t in time])
-        self.count = max(1, int(np.ceil(self.seconds.max() / case.step - SLACK)))
+        steps = np.ceil(self.seconds / case.step - SLACK).astype(int)
+        self.needed = np.maximum(steps, 1)  # steps to the end of each row
+        self.count = int(self.needed.max())
         self.driven = case.step, case.structure, [x for x in case.on if self._drives(x[0])]
         if like is not None and like.driven == self.driven:
             self.control, self.activation = like.control, like.activation
@@ -107,17 +109,20 @@ class RowMap:
     def _rolled(self, index, qpos, qvel, force):
         n, m = len(index), self.model
         out_q, out_v = np.empty((n, m.nq)), np.empty((n, m.nv))
-        for a in range(0, n, CHUNK):
-            part = slice(a, a + CHUNK)
-            out_q[part], out_v[part] = self._rollout(
-                index[part], qpos[part], qvel[part], force[part]
-            )
+        for count, rows in _alike(self.needed[index]):
+            for a in range(0, len(rows), CHUNK):
+                part = rows[a : a + CHUNK]
+                out_q[part], out_v[part] = self._rollout(
+                    index[part], qpos[part], qvel[part], force[part], count
+                )
         return out_q, out_v
 
-    def _rollout(self, index, qpos, qvel, force):
+    def _rollout(self, index, qpos, qvel, force, count):
+        """As _rolled, of rows that take no more steps than `count`."""
         m, n = self.model, len(index)
         state = np.concatenate([np.zeros((n, 1)), qpos, qvel, self.activation[index]], 1)
-        control = np.concatenate([self.control[index], np.repeat(force[:, None], self.count, 1)], 2)
+        control = self.control[index, :count]
+        control = np.concatenate([control, np.repeat(force[:, None], count, 1)], 2)
         number = threads() or 2
         path, _ = rollout.rollout(
             m,
@@ -125,13 +130,13 @@ class RowMap:
             state,
             control,
             control_spec=INPUT,
-            nstep=self.count,
+            nstep=count,
         )
         path = np.concatenate([state[:, None], path], 1)
         x = self.seconds[index] / self.case.step
-        k = np.clip(np.floor(x + SLACK).astype(int), 0, self.count)
+        k = np.clip(np.floor(x + SLACK).astype(int), 0, count)
         f = np.where(abs(x - k) <= 1.5 * SLACK, 0.0, x - k)[:, None]
-        rows, after = np.arange(n), np.minimum(k + 1, self.count)
+        rows, after = np.arange(n), np.minimum(k + 1, count)
         here, there = path[rows, k], path[rows, after]
         q0, q1 = here[:, 1 : 1 + m.nq], there[:, 1 : 1 + m.nq]
         v0, v1 = (x[:, 1 + m.nq : 1 + m.nq + m.nv] for x in (here, there))
@@ -246,3 +251,15 @@ class RowMap:
                 block[:, :nv, k] = difference(self.nominal, q, q1) / eps
                 block[:, nv:, k] = (v1 - v) / eps
         return q, v, A, B
+
+
+def _alike(needed):
+    """[(count, rows)]: rows (n,) of needed steps (n,) together, up to twice the least: where one
+    row is long, the others take no more steps."""
+    out, left = [], np.arange(len(needed))
+    while len(left):
+        most = 2 * needed[left].min()
+        within = needed[left] < most
+        out.append((int(needed[left[within]].max()), left[within]))
+        left = left[~within]
+    return out

@@ -1,8 +1,11 @@
 """One row ahead against plain loops of mj_step, and its derivatives against central differences."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
+from mujoco import rollout
 
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.rows import RowMap
@@ -100,6 +103,28 @@ def test_derivatives_are_central_differences_of_stock_steps(xml):
             slope = np.concatenate([slope, (up[1] - down[1]) / (2 * small)])
             own = np.concatenate([A[k], B[k]], 1)[:, column]
             np.testing.assert_allclose(own, slope, atol=2e-4 * max(1.0, abs(slope).max()))
+
+
+def test_a_hole_costs_the_other_rows_nothing(monkeypatch):
+    here = world()
+    run = uneven(here.model)
+    time = run.time + np.where(np.arange(12) > 5, 1.0, 0.0)  # a second is missing
+    rows = RowMap(here, [dataclasses.replace(run, time=time)], {})
+    steps, rolled = [], rollout.rollout
+
+    def counted(model, data, state, control, **more):
+        steps.append(len(state) * more["nstep"])
+        return rolled(model, data, state, control, **more)
+
+    monkeypatch.setattr(rollout, "rollout", counted)
+    state = some_states(here.model, 11)
+    together = rows.ahead(np.arange(11), *state)
+    least = np.ceil(np.diff(time) / here.model.opt.timestep).sum()
+    assert sum(steps) < 2 * least
+    for k in range(11):
+        alone = rows.ahead(np.array([k]), *(x[k : k + 1] for x in state))
+        np.testing.assert_array_equal(together[0][k], alone[0][0])
+        np.testing.assert_array_equal(together[1][k], alone[1][0])
 
 
 def test_rows_that_are_skipped_cost_nothing_and_change_no_other():
