@@ -12,6 +12,7 @@ PAGES += sorted((ROOT / "docs").glob("*.md"))
 WORDS = 25  # of a sentence
 SHORT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")]
 SHORT += [ROOT / "docs" / f"{name}.md" for name in ("index", "diagnosis-json", "limits")]
+SHORT += [ROOT / "docs" / f"{name}.md" for name in ("recordings", "paper", "results", "validation")]
 LINK = re.compile(r"(?:\]\(|<img src=\")([^)\"\s]+)")
 
 
