@@ -1,8 +1,9 @@
 """The example of the README: a real two-link arm, diagnosed, as numbers and as a picture.
 
-python benchmarks/example.py            # diagnose, write results/example.csv, draw
-docs/diagnosis.png
-python benchmarks/example.py --draw     # only draw what results/example.csv holds
+    python benchmarks/example.py         # diagnose, results/example.csv and docs/diagnosis.png
+    python benchmarks/example.py --draw  # only draw what results/example.csv holds
+
+It prints what docs/validation.md quotes.
 """
 
 import argparse
@@ -28,12 +29,14 @@ def compute():
     """Rows (panel, x, measured, nominal, corrected) of the three panels."""
     from diagnosis.command import diagnose
     from diagnosis.recordings import inverse_dynamics
+    from diagnosis.report.text import terminal
 
     diagnosis = diagnose(
         os.path.join(RIG, "model.xml"),
         sorted(glob.glob(os.path.join(RIG, "train*.csv"))),
         sorted(glob.glob(os.path.join(RIG, "heldout*.csv"))),
     )
+    print(terminal(diagnosis.summary, "report", []))
     rows = []
     trace = next(t for t in diagnosis.traces if t["channel"] == "qpos:elbow")
     for k in np.flatnonzero(trace["time"] <= 5)[::2]:
