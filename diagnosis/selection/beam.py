@@ -47,7 +47,9 @@ class Beam:
         for _ in range(DEPTH):
             grown = []
             for node in beam:
-                for k in self._looks(node):
+                # first every option in full: what lowers squares most is not what lowers their
+                # logarithm most, and what comes first decides what is tried beside it
+                for k in self.free if node is start else self._looks(node):
                     options = (*node.options, k)
                     key = tuple(sorted(options))
                     if key in met:
@@ -57,8 +59,16 @@ class Beam:
                         grown.append(new)
             if not grown:
                 break
-            beam = sorted(grown, key=lambda n: n.loss)[:WIDTH]
+            beam = self._different(grown)[:WIDTH]
         return start, sorted(met.values(), key=lambda n: n.loss)
+
+    def _different(self, nodes):
+        """The best node of each set of candidates, best first."""
+        best = {}
+        for node in sorted(nodes, key=lambda n: n.loss):
+            candidates = frozenset(self.columns.options[k].candidate for k in node.options)
+            best.setdefault(candidates, node)
+        return list(best.values())
 
     def gains(self, node):
         """Nats that every option promises beside a node's, in a first look: a list."""
