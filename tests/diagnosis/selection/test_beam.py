@@ -1,0 +1,42 @@
+"""The beam on made columns: which sets it meets."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from synthetic import clustered, evidence_of, scene
+
+from diagnosis.selection.beam import Beam
+from diagnosis.selection.columns import Option
+from diagnosis.selection.plausibility import Prior
+
+
+class Named:
+    """As much of a Candidate as a beam reads."""
+
+    def __init__(self, name):
+        self.name, self.effect, self.parameters = name, SimpleNamespace(simplicity=0), (None,)
+
+
+def test_two_that_explain_all_are_met_beside_many_that_each_lower_squares_more():
+    rng, ahead = np.random.default_rng(0), scene()
+    strong, weak, wrong = (clustered(rng, ahead, share=0.0) for _ in range(3))
+    weak *= np.where(np.arange(16) % 2 == 0, 0.04, 0.4)[ahead.group][:, None, None]
+    residual = strong + weak
+    named = [("strong", strong), ("weak", weak)]
+    named += [(f"near {k // 3}", residual + 0.22 * wrong) for k in range(12)]  # starts of four
+    named += [(f"rough {k}", residual + 0.24 * wrong) for k in range(4)]
+    columns = np.stack([column for _, column in named], -1)
+    every = {name: Named(name) for name, _ in named}
+    vague = Prior(np.zeros(1), np.full(1, np.inf), np.full(1, -9.0), np.full(1, 9.0))
+    bounds = np.full(1, -9.0), np.full(1, 9.0)
+    options = [
+        Option(every[name], np.zeros(1), np.ones((1, 1)), (k,), *bounds, vague)
+        for k, (name, _) in enumerate(named)
+    ]
+    evidence = evidence_of(ahead, residual, columns)
+    beam = Beam(SimpleNamespace(options=options, setting={}), evidence)
+    start, nodes = beam.nodes()
+    gains = beam.gains(start)
+    assert max(gains[:2]) < min(gains[2:])  # a look at squares leaves them out
+    met = [{options[k].candidate.name for k in node.options} for node in nodes]
+    assert met[0] == {"strong", "weak"}
