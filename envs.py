@@ -99,12 +99,16 @@ class Task:
 
 
 class InvertedPendulum(Task):
+    """The pole on a cart: an episode ends where it leans."""
+
     def unhealthy(self, qpos, qvel):
         finite = np.isfinite(qpos).all(1) & np.isfinite(qvel).all(1)
         return ~finite | (np.abs(qpos[:, 1]) > 0.2)
 
 
 class Hopper(Task):
+    """The hopper: an episode ends where it sinks, leans, or is thrown about."""
+
     def unhealthy(self, qpos, qvel):
         state = np.concatenate((qpos[:, 2:], qvel), axis=1)
         healthy = ((-100.0 < state) & (state < 100.0)).all(1)

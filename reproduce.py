@@ -125,6 +125,7 @@ def commit():
 
 
 def parse(argv):
+    """The parsed command line."""
     parser = argparse.ArgumentParser(
         prog="reproduce.py",
         description=__doc__,

@@ -216,9 +216,8 @@ class GroundingSettings:
     # rgat, oracle: R_AT in units of each dimension's change in a real step, not as it stands
     per_step: bool = True
     smoothing: float = 0.95  # gat: a_hat = smoothing * g(s, a) + (1 - smoothing) * a
-    ane_width: float = (
-        0.2  # ane: standard deviation of the action noise, in units of half the action range
-    )
+    # ane: standard deviation of the action noise, in units of half the action range
+    ane_width: float = 0.2
 
 
 class Grounding:

@@ -202,6 +202,7 @@ def roll_back(s, run, learner, reached):
 
 
 def standard_error(x):
+    """Of the mean of x, a vector; 0 of a single number."""
     return float(x.std(ddof=1) / np.sqrt(len(x))) if len(x) > 1 else 0.0
 
 
@@ -417,6 +418,8 @@ def replay(folder):
 
 
 class Parser(argparse.ArgumentParser):
+    """Raises RunError where argparse would end the program."""
+
     def error(self, message):
         raise RunError(f"{message}; see --help")
 

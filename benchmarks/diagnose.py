@@ -1,13 +1,12 @@
-"""Time a diagnosis of 30 s of a two-joint arm, against mujoco.sysid fitting a fixed list of
-candidates all at once, and of Hopper.
+"""Time a diagnosis: of a two-joint arm beside mujoco.sysid, and of Hopper.
 
     python benchmarks/diagnose.py [--seconds 30]        # -> results/diagnose.csv
 
-Hidden in the arm: Coulomb friction in the elbow. sysid is told the candidates (mass, armature,
-damping, frictionloss: eight parameters), true start velocities and one-second sequences; the
-diagnosis is told nothing. mujoco.sysid needs extra packages (requirements-extras.txt); without them
-only the diagnosis is timed. Hidden in Hopper: a torso 27 % heavier, in falls of 1.5 s each. Seconds
-are those of the clock, and of all threads together.
+Hidden in the arm: Coulomb friction in the elbow. sysid fits all its candidates at once: it is told
+which (mass, armature, damping, frictionloss: eight parameters), true start velocities and
+one-second sequences; the diagnosis is told nothing. mujoco.sysid needs extra packages
+(requirements-extras.txt); without them only the diagnosis is timed. Hidden in Hopper: a torso 27 %
+heavier, in falls of 1.5 s each. Seconds are those of the clock, and of all threads together.
 """
 
 import argparse

@@ -24,6 +24,7 @@ RETURN = "return on real, deterministic"
 
 
 def read(name):
+    """The rows of a table in results/, [] where there is none."""
     path = RESULTS / name
     return list(csv.DictReader(path.open(newline=""))) if path.exists() else []
 
@@ -94,6 +95,7 @@ def level(axes, values, color, label):
 
 
 def seeds_of(values):
+    """How many seeds, in words."""
     return f"{len(values)} seed{'s' * (len(values) > 1)}"
 
 

@@ -1,5 +1,4 @@
-"""A robot to try the tool on as a newcomer has it: arm.urdf, and four ROS 2 bags of its joint
-states.
+"""A robot as a newcomer has it: arm.urdf, and four ROS 2 bags of its joint states.
 
     python benchmarks/newcomer.py demo
 

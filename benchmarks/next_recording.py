@@ -1,5 +1,6 @@
-"""Does the recording that `diagnose.py --next` designs leave only the truth? Sealed trials in
-simulation.
+"""Does the recording that `diagnose.py --next` designs leave only the truth?
+
+Sealed trials in simulation.
 
     python benchmarks/next_recording.py --trials 12 --seed 1          # writes results/next.csv
 

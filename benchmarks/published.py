@@ -1,5 +1,4 @@
-"""Does a diagnosis predict real recordings as well as what was published of the rig?
-results/published.csv.
+"""Does a diagnosis predict real rigs as well as what was published? results/published.csv.
 
     python benchmarks/published.py [--recordings ../shared/recordings] [--only emps]
 

@@ -114,6 +114,7 @@ def reaches(arm, at=-1):
 
 
 def falls_short(arm):
+    """How far an arm stays below what `reaches` asks for."""
     return lambda data: -reaches(arm)(data)
 
 
@@ -136,10 +137,12 @@ def best_width(data):
 
 
 def best_width_reaches(data):
+    """As `reaches`, of the best width of the action noise envelope."""
     return reaches(best_width(data))(data)
 
 
 def best_width_falls_short(data):
+    """As `falls_short`, of the best width."""
     return falls_short(best_width(data))(data)
 
 

@@ -59,6 +59,7 @@ PRESET = {
 
 
 def option(default, help, **extra):
+    """A field of Settings with its line of --help; extra: what argparse is told besides."""
     return field(default=default, metadata={"help": help, **extra})
 
 

@@ -78,6 +78,7 @@ def integrate(model, qpos, step):
 
 
 def joint_name(model, joint):
+    """What columns call a joint: its name, or its index where it has none."""
     return model.joint(joint).name or str(joint)
 
 

@@ -9,6 +9,8 @@ from trpo import TRPOConfig
 
 
 class Walker2d(Task):
+    """The walker: an episode ends where it falls, or bends over."""
+
     def unhealthy(self, qpos, qvel):
         """Fallen, or bent over."""
         height, angle = qpos[:, 1], qpos[:, 2]
