@@ -1,4 +1,4 @@
-"""Who predicts a real machine best? results/contest.csv, docs/contest.png and its table.
+"""Who predicts a real machine best? results/contest.csv, docs/contest.png, table of docs/contest.md.
 
     python benchmarks/contest.py [--recordings ../shared/recordings] [--only go2_leg] [--by sysid]
     python benchmarks/contest.py --draw                  # the picture and the table from the CSV
@@ -35,7 +35,7 @@ import sysid as entrant  # noqa: E402
 from common import Recording  # noqa: E402
 from fields import fields  # noqa: E402
 
-from diagnosis.common.atomic_files import write_table  # noqa: E402
+from diagnosis.common.atomic_files import write_table, write_whole  # noqa: E402
 from diagnosis.estimation import prediction_error  # noqa: E402
 from diagnosis.estimation import windows as cut  # noqa: E402
 from diagnosis.handover import Files  # noqa: E402
@@ -43,6 +43,8 @@ from diagnosis.nominal.model import load_world  # noqa: E402
 from diagnosis.recordings import recording as recorded  # noqa: E402
 
 COLUMNS = ("rig", "entrant", "unit", "error", "scatter", "values", "seconds", "commit")
+PAGE = ROOT / "docs" / "contest.md"
+BEGIN, END = "<!-- table of benchmarks/contest.py -->", "<!-- end of the table -->"
 COLORS = {"nominal": "#999999", "sysid": "#d98b1f", "published": "#7b5aa6", "diagnosis": "#1f5fa8"}
 SECONDS = 3600  # of the processor, for one entrant
 
@@ -310,14 +312,30 @@ def draw(rows, path):
 
 
 def table(rows):
-    """The rows as Markdown."""
-    head = "| rig | entrant | held-out error | scatter | seconds |\n|---|---|---|---|---|"
-    lines = [
-        f"| {r['rig']} | {r['entrant']} | {r['error']} {r['unit']} | {r['scatter'] or '–'} |"
-        f" {r['seconds'] or '–'} |"
-        for r in rows
-    ]
+    """The rows as Markdown, the least error of each rig in bold."""
+    head = (
+        "| rig | entrant | held-out error | scatter | seconds | commit |\n|---|---|---|---|---|---|"
+    )
+    least = {}
+    for r in rows:
+        key = r["rig"], r["unit"]
+        least[key] = min(least.get(key, np.inf), float(r["error"]))
+    lines = []
+    for r in rows:
+        best = float(r["error"]) == least[r["rig"], r["unit"]]
+        error = f"{r['error']} {r['unit']}"
+        lines.append(
+            f"| {r['rig']} | {r['entrant']} | {f'**{error}**' if best else error} |"
+            f" {r['scatter'] or '–'} | {r['seconds'] or '–'} | {r['commit']} |"
+        )
     return "\n".join([head, *lines])
+
+
+def put_into(text, rows):
+    """The page's text with the table of the rows."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}\n\n{table(rows)}\n\n{END}{after}"
 
 
 def parse():
@@ -355,7 +373,7 @@ def main():
                 print(*row.values(), sep=" | ", flush=True)
     if rows:
         draw(rows, ROOT / "docs" / "contest.png")
-        print(table(rows))
+        write_whole(PAGE, put_into(PAGE.read_text(encoding="utf-8"), rows))
 
 
 if __name__ == "__main__":
