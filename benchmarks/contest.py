@@ -1,4 +1,4 @@
-"""Who predicts a real machine best? results/contest.csv, docs/contest.png, table of docs/contest.md.
+"""Who predicts a real machine best? results/contest.csv, docs/contest.png, docs/contest.md.
 
     python benchmarks/contest.py [--recordings ../shared/recordings] [--only go2_leg] [--by sysid]
     python benchmarks/contest.py --draw                  # the picture and the table from the CSV
