@@ -10,6 +10,7 @@ from diagnosis.selection.judge import moved_setting, problem
 
 WIDTH, LOOKS = 5, 10  # sets that are carried on, and further effects tried in each in full
 DEPTH = 4  # effects added in one round
+LEAST = 0.01  # loss that an effect must remove in the search
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,13 @@ class Node:
 
     options: tuple
     score: Score
-    loss: float
+    cost: float  # of its values, and of its complexity
+    price: float
+
+    @property
+    def loss(self):
+        """What sets are ranked by."""
+        return self.score.loss + self.cost + self.price
 
 
 class Beam:
@@ -36,9 +43,8 @@ class Beam:
         score = self.evidence.score(*given)
         setting = moved_setting(self.columns, score.amounts, options)
         chosen = [self.columns.options[k] for k in options]
-        cost = sum(o.prior.cost(setting[o.candidate]) for o in chosen)
-        price = PRICE * complexity(o.candidate for o in chosen)
-        return Node(tuple(options), score, score.loss + price + cost / self.evidence.number)
+        cost = sum(o.prior.cost(setting[o.candidate]) for o in chosen) / self.evidence.number
+        return Node(tuple(options), score, cost, PRICE * complexity(o.candidate for o in chosen))
 
     def nodes(self):
         """(node of the model as it is, all nodes met, best first)."""
@@ -55,20 +61,39 @@ class Beam:
                     if key in met:
                         continue
                     met[key] = new = self.node(options)
-                    if new.loss < node.loss:
+                    if self._left(new) < self._left(node) - LEAST:
                         grown.append(new)
             if not grown:
                 break
             beam = self._different(grown)[:WIDTH]
+            for node in beam:
+                self._reduced(node, met)
         return start, sorted(met.values(), key=lambda n: n.loss)
 
     def _different(self, nodes):
         """The best node of each set of candidates, best first."""
         best = {}
-        for node in sorted(nodes, key=lambda n: n.loss):
+        for node in sorted(nodes, key=self._left):
             candidates = frozenset(self.columns.options[k].candidate for k in node.options)
             best.setdefault(candidates, node)
         return list(best.values())
+
+    def _reduced(self, node, met):
+        """Meet the sets that are left when effects go again, first the one that is missed least."""
+        while len(node.options) > len(self.kept) + 1:
+            fewer = []
+            for out in node.options[len(self.kept) :]:
+                options = tuple(k for k in node.options if k != out)
+                key = tuple(sorted(options))
+                if key not in met:
+                    met[key] = self.node(options)
+                fewer.append(met[key])
+            node = min(fewer, key=lambda n: n.loss)
+
+    @staticmethod
+    def _left(node):
+        """What the search goes by: a price paid early hides what two effects do together."""
+        return node.score.loss + node.cost
 
     def gains(self, node):
         """Nats that every option promises beside a node's, in a first look: a list."""

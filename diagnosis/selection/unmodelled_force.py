@@ -6,17 +6,22 @@ found.candidate
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from diagnosis.effects.base import HINGE, SLIDE
+from diagnosis.effects.drives import drives_of
+from diagnosis.effects.unmodelled import asked
 from diagnosis.estimation import windows as cut
 
 KNOTS = 9
 BLOCKS = 16  # stretches of time that are left out in turn
 # share of the located force's variance, predicted on stretches left out, that a curve must explain
 LEAST = 0.03
+WAVES = 2.0, 30.0, 0.1  # periods over the travel, from, to and by, of forces that come and go
+SAMPLED = 2000  # rows in which these are looked for
 CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 
 
@@ -48,26 +53,17 @@ def dependences(world, trajectory, recordings, most=4):
         force = trajectory.force[keep, d]
         size = 1.4826 * np.median(abs(force)) + 1e-300
         force = np.clip(force, -CLIP * size, CLIP * size)
-        sign = np.tanh(trajectory.qvel[keep, d] / np.maximum(trajectory.qvel_sd[keep, d], 1e-9))
-        tried = []
         for variable, x in axes.items():
-            tried.append((variable, None, x[keep], np.ones_like(force)))
-            if variable == f"position:{name}":
-                tried.append((variable, f"velocity:{name}", x[keep], sign))
-        for variable, factor, x, times in tried:
-            share, rms, knots, values = _explained(force, x, times, block, variable)
-            if share > LEAST:
-                candidate = world.curve(name, variable, knots, factor)
-                found.append(
-                    Dependence(
-                        name,
-                        (variable,) + ((factor,) if factor else ()),
-                        share,
-                        rms,
-                        candidate,
-                        tuple(float(v) for v in values),
-                    )
-                )
+            for factor, times in _factors(model, trajectory, ctrl, j, variable).items():
+                own = variable == f"position:{name}"
+                for wave in (False, True)[: 1 + own]:
+                    curve = _explained(force, x[keep], times[keep], block, variable, wave)
+                    if curve.share > LEAST:
+                        candidate = world.curve(name, variable, curve.knots, factor, wave)
+                        told = (variable,) + ((factor,) if factor else ())
+                        values = tuple(map(float, curve.values))
+                        each = name, told, curve.share, curve.rms, candidate, values
+                        found.append(Dependence(*each))
     return sorted(found, key=lambda f: -f.share)[:most]
 
 
@@ -86,6 +82,21 @@ def _axes(model, trajectory, ctrl, time):
     return {name: x for name, x in axes.items() if np.ptp(x) > 1e-9}
 
 
+def _factors(model, trajectory, ctrl, j, variable):
+    """{factor: (rows,)} of what a curve over a variable may be multiplied by: of the joint's own
+    and of time, the sign of its speed, as friction has, and what its drives are asked for."""
+    name, out = cut.joint_name(model, j), {None: np.ones(len(ctrl))}
+    d = model.jnt_dofadr[j]
+    if variable in ("time", f"position:{name}"):
+        speed, sd = trajectory.qvel[:, d], np.maximum(trajectory.qvel_sd[:, d], 1e-9)
+        out[f"velocity:{name}"] = np.tanh(speed / sd)
+    if variable in ("time", f"position:{name}", f"velocity:{name}"):
+        for a in drives_of(model, j):
+            times = asked(model, a, trajectory.qpos, trajectory.qvel, ctrl)
+            out[f"control:{model.actuator(a).name}"] = times
+    return out
+
+
 def knots_of(x, variable):
     """Knots (KNOTS,) over what was recorded; of velocities closer about zero."""
     low, high = np.quantile(x, [0.005, 0.995])
@@ -98,20 +109,43 @@ def knots_of(x, variable):
     return np.linspace(low, high, KNOTS)
 
 
-def _explained(force, x, times, block, variable):
-    """(share predicted on blocks left out, RMS of the curve's force, knots, values)."""
-    knots = knots_of(x, variable)
-    if len(knots) < 3:
-        return 0.0, 0.0, knots, np.zeros(len(knots))
-    basis = np.stack([np.interp(x, knots, e) for e in np.eye(len(knots))], 1) * times[:, None]
-    ridge = 1e-4 * len(x) / len(knots) * np.eye(len(knots))
+class Curve(NamedTuple):
+    """share: of the force's variance, predicted on blocks left out; rms: of the curve's force."""
+
+    share: float
+    rms: float
+    knots: np.ndarray
+    values: np.ndarray
+
+
+def _explained(force, x, times, block, variable, wave=False):
+    """The Curve of a force over x, times a factor: linear between knots, or a wave."""
+    knots = _quarter(force, x, times) if wave else knots_of(x, variable)
+    if len(knots) < 2 + (not wave):
+        return Curve(0.0, 0.0, knots, np.zeros(len(knots)))
+    if wave:
+        turn = np.pi / 2 * (x - knots[0]) / (knots[1] - knots[0])
+        basis = np.stack([np.cos(turn), np.sin(turn)], 1) * times[:, None]
+    else:
+        basis = np.stack([np.interp(x, knots, e) for e in np.eye(len(knots))], 1) * times[:, None]
     number = block.max() + 1
     gram = np.array([basis[block == b].T @ basis[block == b] for b in range(number)])
     score = np.array([basis[block == b].T @ force[block == b] for b in range(number)])
+    ridge = 1e-4 * np.trace(gram.sum(0)) / len(knots) * np.eye(len(knots))
     left = 0.0
     for b in range(number):
         values = np.linalg.solve(gram.sum(0) - gram[b] + ridge, score.sum(0) - score[b])
         left += np.sum((force[block == b] - basis[block == b] @ values) ** 2)
     values = np.linalg.solve(gram.sum(0) + ridge, score.sum(0))
     total = np.sum(force**2) + 1e-300
-    return 1 - left / total, float(np.sqrt(np.mean((basis @ values) ** 2))), knots, values
+    return Curve(1 - left / total, float(np.sqrt(np.mean((basis @ values) ** 2))), knots, values)
+
+
+def _quarter(force, x, times):
+    """(zero, a quarter of the period) of the wave over x that is most like a force."""
+    some = cut.evenly(len(x), SAMPLED)
+    low, high = np.quantile(x, [0.005, 0.995])
+    number = np.arange(*WAVES) * 2 * np.pi / max(high - low, 1e-9)
+    turned = np.exp(1j * np.outer(number, x[some])) * times[some]
+    like = abs(turned @ force[some]) / np.sqrt((abs(turned) ** 2).sum(1) + 1e-300)
+    return np.array([0.0, np.pi / 2 / number[np.argmax(like)]])
