@@ -200,8 +200,8 @@ class Local:
         scene, setting = self.scene, self.scene.setting
         plain = scene.left([setting])[0]
         for curve in curves:
-            if "time" in curve.variables:
-                continue
+            if "time" in curve.variables or any("control" in name for name in curve.variables[1:]):
+                continue  # of two kinds at once, it is no simpler than an event
             column = plain - scene.left([{**setting, curve.candidate: curve.values}])[0]
             if (column * plain).sum() ** 2 > 0.5 * gain * max((column**2).sum(), 1e-300):
                 return True

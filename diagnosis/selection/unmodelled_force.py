@@ -20,7 +20,7 @@ KNOTS = 9
 BLOCKS = 16  # stretches of time that are left out in turn
 # share of the located force's variance, predicted on stretches left out, that a curve must explain
 LEAST = 0.03
-WAVES = 2.0, 30.0, 0.1  # periods over the travel, from, to and by, of forces that come and go
+WAVES = 4.0, 30.0, 0.1  # periods over the travel, from, to and by, of forces that come and go
 SAMPLED = 2000  # rows in which these are looked for
 CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 
