@@ -17,6 +17,7 @@ import numpy as np
 
 from diagnosis.common.distributions import chi2_ppf, f_sf
 from diagnosis.estimation import windows as cut
+from diagnosis.selection.criterion import PRICE, complexity
 from diagnosis.selection.event import SPAN, Local, Look, Windows, solved
 from diagnosis.selection.unmodelled_force import dependences
 
@@ -60,13 +61,20 @@ def find(world, recordings, setting, trajectory, noise):
     p = f_sf(gain / k / spread, k, max(number - k, 1)) * number**2 * len(looks)
     ceiling = usual + 4 * (usual - np.quantile(each, 0.16))  # of windows without an event
     excess = ((each - ceiling).clip(0) * scene.rows).sum()
-    if p > LEVEL or gain < CONCENTRATED * excess:
+    if p > LEVEL or gain < CONCENTRATED * excess or not _worth(look, scene, chi2, a, gain):
         return None
     local = Local(scene, trajectory, chi2, a, b)
     event = local.event(look, min(float(p), 1.0))
     if local.lasting(gain, dependences(world, trajectory, recordings)):
         return None
     return replace(event, others=local.others(event, looks, look, gain))
+
+
+def _worth(look, scene, chi2, a, gain):
+    """Whether an effect takes enough of the error of its own recording for what is asked of any."""
+    own = [w.recording is scene.windows[a].recording for w in scene.windows]
+    removed = np.log(chi2[own].sum() / max(chi2[own].sum() - gain, 1e-300)) / 2
+    return removed > PRICE * complexity([look.timed])
 
 
 def _loudest(trajectory, windows):
