@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from diagnosis.selection.criterion import PRICE, Score, complexity
 from diagnosis.selection.judge import moved_setting, problem
 
-WIDTH, LOOKS = 5, 10  # sets that are carried on, and further effects tried in each in full
+WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in each in full
 DEPTH = 4  # effects added in one round
 LEAST = 0.01  # loss that an effect must remove in the search
 

@@ -192,6 +192,7 @@ class Evidence:
         curve = own.copy()
         if len(index) > 1:
             cross = beside[1:, 1:]
+            inside += 1e-9 * np.diag(np.diag(inside))  # of two columns that are the same
             curve -= (cross * np.linalg.solve(inside, cross.T).T).sum(1)
         seen = curve > 1e-9 * np.maximum(own, 1e-300)
         return np.where(seen, score**2 / np.where(seen, curve, 1.0) / 2, 0.0)

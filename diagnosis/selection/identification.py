@@ -4,6 +4,7 @@ found = Identification(world, train).run()
 found.fitted.setting; found.trajectory
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
@@ -11,13 +12,14 @@ from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import Evidence, complexity, paired
+from diagnosis.selection.criterion import PRICE, Evidence, complexity, paired
 from diagnosis.selection.judge import Fitted, Judge
 from diagnosis.selection.plausibility import Usual
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
 IDLE = 1.0  # nats that an effect must promise beside those chosen, to be looked at once more
+ANEW = 4  # times that a set is fitted to start states of its own, at most
 FINALISTS = 4  # sets that the simulator judges in a round
 
 
@@ -51,7 +53,7 @@ class Identification:
     def run(self):
         """The Found of all rounds."""
         self.say(0.0, "locating the missing force")
-        smoother = Smoother(self.world, self.train)
+        self.smoother = smoother = Smoother(self.world, self.train)
         first = trajectory = smoother.locate({})
         self.usual = Usual(self.world, self.train, smoother.scale)
         self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
@@ -91,18 +93,32 @@ class Identification:
         judge = Judge(self.ahead, self.usual, seen=self.seen)
         now = judge.fit(setting)
         judge.reference = now.evidence.floor
-        judged = [now]
+        judged = {now: judge}
         for node in self._finalists(beam, start, nodes):
-            fitted = judge.fit(beam.setting(node), steps=3)
+            fitted, by = self._begun_anew(judge, judge.fit(beam.setting(node), steps=3))
             self.log(f"  linear {node.loss:.3f} judged {fitted.loss:.3f} {said(fitted.setting)}")
-            judged.append(fitted)
+            judged[fitted] = by
         number = len({o.candidate for o in columns.options})
-        best = self._choose(judged, now, number)
+        best = self._choose(list(judged), now, number)
         if best is not now:
+            judge = judged[best]
             best = self.pruned(judge, judge.fit(best.setting))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
             self._set_aside(beam, columns, best)
         return best, best is not now, [] if setting else self._ranking(beam, start)
+
+    def _begun_anew(self, judge, fitted):
+        """(Fitted again, its Judge) from the start states that the recordings have under a set: of
+        a poor model's motion they are too uncertain to tell a good one."""
+        smoother, trajectory, ahead = copy(self.smoother), self.trajectory, copy(judge.ahead)
+        again = Judge(ahead, self.usual, judge.reference, self.seen)
+        for k in range(ANEW):
+            trajectory = smoother.locate(fitted.setting, trajectory, passes=1)
+            ahead.start(trajectory)
+            before, fitted = fitted, again.fit(fitted.setting, steps=2)
+            if k and fitted.loss > before.loss - PRICE / 4:
+                break
+        return fitted, again
 
     def _set_aside(self, beam, columns, chosen):
         """Leave out of further rounds what would have added nothing beside the chosen effects."""
@@ -113,23 +129,18 @@ class Identification:
             most[option.candidate] = max(most.get(option.candidate, 0.0), gain)
         self.idle |= {c for c, gain in most.items() if c not in chosen.setting and gain < IDLE}
 
-    def _finalists(self, beam, start, nodes):
-        """Nodes for the simulator: the best, and the best of each first effect and each size."""
-        chosen, seen = [], set()
+    @staticmethod
+    def _finalists(beam, start, nodes):
+        """Nodes for the simulator, best first: of other effects, and not a better one and more."""
+        chosen, seen = [], []
         for node in nodes:
-            if node.loss >= start.loss:
+            if node.loss >= start.loss or len(chosen) == FINALISTS:
                 break
-            names = frozenset(
-                beam.columns.options[k].candidate for k in node.options[len(start.options) :]
-            )
-            if names in seen:
-                continue
-            size = sum(len(n) == len(names) for n in seen)
-            if size < 2 or len(chosen) < 2:
-                seen.add(names)
+            options = beam.columns.options
+            names = {options[k].candidate for k in node.options[len(start.options) :]}
+            if not any(names >= better for better in seen):
+                seen.append(names)
                 chosen.append(node)
-            if len(chosen) >= FINALISTS:
-                break
         return chosen
 
     def _choose(self, judged, now, number):

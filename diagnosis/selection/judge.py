@@ -18,7 +18,7 @@ DONE = 2e-3  # loss that another step would still remove, from which on a refit 
 HALVINGS = 3  # of a step that does not lower the loss
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fitted:
     """A set of effects refitted. setting: {Candidate: values}; score: of the groups left out,
     priors included; columns, evidence: at these values."""

@@ -22,7 +22,7 @@ TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 #   travel: the joint's recorded range          size, weight: the body's
 #   used, strength: the largest force that the controls ask for
 TABLE = {
-    "mass": [("times", 0.4, 0.2, 5.0)],
+    "mass": [("times", 0.4, 0.05, 30.0)],
     "payload_change": [("times", 0.4, 0.3, 3.0)],
     "center_of_mass": [("size", 0.3, -1.5, 1.5)],
     "inertia": [("times", 0.4, 0.25, 4.0)],
