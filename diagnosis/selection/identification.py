@@ -68,9 +68,8 @@ class Identification:
             ranking = ranking or look
             if not better:
                 break
-            judge = Judge(self.ahead, self.usual, seen=self.seen)
-            fitted, _, trajectory = self._begun_anew(judge, fitted, smoother)
             setting = fitted.setting
+            trajectory = smoother.locate(setting, trajectory, passes=1)
         self.ahead.start(trajectory)
         self.screen.start(trajectory)
         judge = Judge(self.ahead, self.usual, seen=self.seen)
@@ -96,8 +95,7 @@ class Identification:
         judge.reference = now.evidence.floor
         judged = {now: judge}
         for node in self._finalists(beam, start, nodes):
-            fitted = judge.fit(beam.setting(node), steps=3)
-            fitted, by, _ = self._begun_anew(judge, fitted, copy(self.smoother))
+            fitted, by = self._begun_anew(judge, judge.fit(beam.setting(node), steps=3))
             self.log(f"  linear {node.loss:.3f} judged {fitted.loss:.3f} {said(fitted.setting)}")
             judged[fitted] = by
         number = len({o.candidate for o in columns.options})
@@ -109,10 +107,10 @@ class Identification:
             self._set_aside(beam, columns, best)
         return best, best is not now, [] if setting else self._ranking(beam, start)
 
-    def _begun_anew(self, judge, fitted, smoother):
-        """(Fitted again, its Judge, the Trajectory) from the start states that the recordings have
-        under a set: of a poor model's motion they are too uncertain to tell a good one."""
-        trajectory, ahead = self.trajectory, copy(judge.ahead)
+    def _begun_anew(self, judge, fitted):
+        """(Fitted again, its Judge) from the start states that the recordings have under a set: of
+        a poor model's motion they are too uncertain to tell a good one."""
+        smoother, trajectory, ahead = copy(self.smoother), self.trajectory, copy(judge.ahead)
         again = Judge(ahead, self.usual, judge.reference, self.seen)
         for k in range(ANEW):
             trajectory = smoother.locate(fitted.setting, trajectory, passes=1)
@@ -120,7 +118,7 @@ class Identification:
             before, fitted = fitted, again.fit(fitted.setting, steps=2)
             if k and fitted.loss > before.loss - PRICE / 4:
                 break
-        return fitted, again, trajectory
+        return fitted, again
 
     def _set_aside(self, beam, columns, chosen):
         """Leave out of further rounds what would have added nothing beside the chosen effects."""
