@@ -1,13 +1,16 @@
 """The criterion: false alarms on pure noise, known improvements, ties, bounds."""
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plants import DRIVEN_PENDULUM
 from scipy.optimize import lsq_linear
 from synthetic import clustered, evidence_of, free, scene
 
-from diagnosis.selection.criterion import Score, bounded, paired
+from diagnosis.selection.criterion import Score, bounded, complexity, paired
+from diagnosis.simulation.simulator import World
 
 
 def test_p_values_of_pure_noise_are_even():
@@ -110,3 +113,13 @@ def test_bounded_least_squares_are_scipys(seed, size):
     found = bounded(x.T @ x, x.T @ y, low, high)
     expected = lsq_linear(x, y, (low, high), method="bvls", tol=1e-12).x
     np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_what_is_farther_from_the_first_things_to_think_of_and_freer_is_more_complex():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.0, mass=0.5)))
+    of = lambda *names: complexity(c for c in world.candidates if c.effect.name in names)
+    curve = world.curve("pivot", "position:pivot", np.linspace(-1, 1, 9))
+    assert of("coulomb_friction") == of("viscous_damping") == 1
+    assert of("coulomb_friction", "viscous_damping") == 2
+    assert of("gain") < of("armature") < of("dead_zone") < of("stribeck_friction")
+    assert of("stribeck_friction") == complexity([curve])

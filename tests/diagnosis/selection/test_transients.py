@@ -59,6 +59,15 @@ def test_a_push_is_placed_in_time_and_what_is_calm_is_cut_out():
     np.testing.assert_array_equal(parts[2].qpos, runs[1].qpos[-len(parts[2].time) :])
 
 
+def test_a_push_that_is_certain_but_changes_little_is_no_event(monkeypatch):
+    pushed = lambda time, q, v: 0.004 * (1.0 < time < 3.0)
+    runs = [recorded(f"{k}.csv", k, push=pushed if k == 1 else None) for k in range(3)]
+    assert found(runs) is None
+    monkeypatch.setattr(transients, "PRICE", 0.0)
+    event = found(runs)
+    assert event.recording is runs[1] and event.p_value < 1e-3
+
+
 @pytest.mark.parametrize(
     "push",
     [

@@ -71,6 +71,16 @@ def test_a_friction_over_the_travel_depends_on_position_and_on_the_sign_of_veloc
     assert found.variables == ("position:j", "velocity:j") and found.share > 0.8
 
 
+def test_ripples_of_what_a_drive_is_asked_for_are_a_wave_times_its_control():
+    law = lambda q, v, u, t: at(0, 0.3 * u[:, 0] * np.sin(14 * q[:, 0] + 1))
+    found = dependences(*made_up(law))[0]
+    assert found.variables == ("position:j", "control:m") and found.share > 0.8
+    zero, quarter = found.candidate.effect.knots
+    assert found.candidate.effect.wave and np.pi / 2 / (quarter - zero) == pytest.approx(
+        14, rel=0.02
+    )
+
+
 def test_noise_depends_on_nothing():
     for seed in range(5):
         assert dependences(*made_up(lambda q, v, u, t: np.zeros((ROWS, 2)), seed=seed)) == []
