@@ -26,6 +26,17 @@ from diagnosis.common.atomic_files import write_table  # noqa: E402
 WHOLE = "whole"  # the method as it is
 RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches it off}
     WHOLE: {},
+    "no price of complexity": {"diagnosis.selection.criterion:PRICE": 0.0},
+    "no start states of its own": {"diagnosis.selection.identification:ANEW": 0},
+    "no correction for the number looked at": {"diagnosis.selection.identification:LEVEL": 1.0},
+    "a beam of one": {"diagnosis.selection.beam:WIDTH": 1},
+    "no values at full size": {"diagnosis.selection.columns:LADDER": ()},
+    "no second look at the values that suit": {"diagnosis.selection.columns:SECANTS": 0},
+    "no classes": {"diagnosis.selection.rivals:ALIKE": 2.0},
+    "no curves beside names": {"diagnosis.selection.unmodelled_force:LEAST": 2.0},
+    "gross windows count": {"diagnosis.selection.criterion:GROSS": 1e9},
+    "no floor of a cell's error": {"diagnosis.selection.criterion:SHARE": 0.0},
+    "one horizon": {"diagnosis.estimation.ahead:HORIZONS": (1.0,)},
 }
 COLUMNS = (
     "rule trials strict strict_whole lost won named named_whole false false_whole "
