@@ -56,7 +56,11 @@ def claims_markdown(claims):
     """The rows of claims.csv as a table."""
     header = "claim|figure|value|95 % interval|seeds|p, corrected|verdict|version"
     row = "{claim}|{figure}|{value}|{low} to {high}|{seeds}|{p_corrected}|**{verdict}**|{version}"
-    return markdown(header, [row.format(**claim).split("|") for claim in claims])
+    told = lambda cell: (
+        "–" if cell in ("nan", "nan to nan") else cell
+    )  # of fewer seeds than it asks
+    cells = [row.format(**claim).split("|") for claim in claims]
+    return markdown(header, [[told(cell) for cell in line] for line in cells])
 
 
 def markdown(header, rows):
