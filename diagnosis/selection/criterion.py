@@ -59,7 +59,8 @@ def paired(before, after):
     """Comparison of two Scores, differences paired by group."""
     d = before.groups - after.groups
     n = len(d)
-    spread = float(np.std(d, ddof=1) / np.sqrt(n)) if n > 1 else np.inf
+    told = n > 1 and np.isfinite(d).all()  # not of values that are impossible
+    spread = float(np.std(d, ddof=1) / np.sqrt(n)) if told else np.inf
     gain = float(before.loss - after.loss)
     if not spread > 0 or not np.isfinite(spread):
         return Comparison(gain, spread, 1.0)

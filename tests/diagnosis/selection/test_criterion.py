@@ -33,6 +33,12 @@ def test_paired_is_students_on_differences():
     assert paired(same, same).p_value == 1.0
 
 
+@pytest.mark.filterwarnings("error")
+def test_values_that_are_impossible_are_no_improvement():
+    possible, impossible = np.ones(4), np.full(4, np.inf)
+    assert paired(Score(1.0, possible, ()), Score(np.inf, impossible, ())).p_value == 1.0
+
+
 def alone(rng, ahead, amount):
     """Comparison of none with one column that is in the residual by an amount, in noises."""
     column, residual = clustered(rng, ahead, (1,)), clustered(rng, ahead)
