@@ -19,8 +19,10 @@ sys.path.insert(0, str(ROOT))
 
 from diagnosis.command import diagnose  # noqa: E402
 from diagnosis.common.atomic_files import write_table  # noqa: E402
-from diagnosis.estimation import prediction_error  # noqa: E402
-from diagnosis.estimation import windows as cut  # noqa: E402
+from diagnosis.estimation import (
+    prediction_error,  # noqa: E402
+    windowing,  # noqa: E402
+)
 
 CSV = ROOT / "results" / "published.csv"
 COLUMNS = ("rig", "model", "window", "channel", "nominal", "published", "diagnosed")
@@ -58,7 +60,7 @@ def rows_of(folder, rig, model, span, published):
     world, windows = found.world, prediction_error.consecutive(found.held_out, span)
     known = {world.candidate(*key): (value,) for key, value in published.items()}
     errors = [
-        cut.error(
+        windowing.error(
             world.model,
             windows,
             prediction_error.predict(world, settings, windows)[0],

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diagnosis.effects.base import JOINT_TRANSMISSIONS
-from diagnosis.estimation import prediction_error
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import prediction_error, windowing
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults, transients
@@ -45,7 +44,7 @@ def assemble(world, train, held_out, outcome):
     bounds = intervals(outcome.fitted)
     figures = {"train": _figure(world, handed, outcome.train_check, settings)}
     figures["held_out"] = _figure(world, handed, outcome.held_check, settings)
-    figures["held_out"]["horizon_s"] = cut.HORIZON
+    figures["held_out"]["horizon_s"] = windowing.HORIZON
     check = outcome.held_check
     figures["held_out"]["curve"] = prediction_error.curve(
         world, settings, check.smoother, check.trajectory, check.noise
@@ -184,7 +183,7 @@ def noise_by_channel(model, position_noise):
     """{channel: noise in SI}."""
     return {
         name: float(np.sqrt(np.mean(position_noise[dofs] ** 2)))
-        for name, dofs in cut.channels(model).items()
+        for name, dofs in windowing.channels(model).items()
         if np.isfinite(position_noise[dofs]).all()
     }
 
@@ -209,8 +208,8 @@ def _figure(world, handed: Handed, check, settings):
 
 def unit_of(model, channel):
     """Unit of a position channel."""
-    for j, kind, _, _ in cut.joint_slices(model):
-        name = "qpos:" + cut.joint_name(model, j)
+    for j, kind, _, _ in windowing.joint_slices(model):
+        name = "qpos:" + windowing.joint_name(model, j)
         if channel == name + ":pos" or (channel == name and kind.name == "mjJNT_SLIDE"):
             return "m"
     return "rad"
@@ -225,7 +224,7 @@ def depends_on(model, candidate):
             actuator.trntype[0] not in JOINT_TRANSMISSIONS
         ):  # a site or tendon moves with many joints
             return []
-        name = cut.joint_name(model, actuator.trnid[0])
+        name = windowing.joint_name(model, actuator.trnid[0])
     return [f"{variable}:{name}"] if variable else []
 
 
@@ -234,8 +233,8 @@ def missing_force(world, outcome):
     lacks."""
     out, model = {}, world.model
     first, last = outcome.found.first, outcome.trajectory
-    for j, kind, _, v in cut.joint_slices(model):
-        name = cut.joint_name(model, j)
+    for j, kind, _, v in windowing.joint_slices(model):
+        name = windowing.joint_name(model, j)
         for i, d in enumerate(range(v.start, v.stop)):
             rms = [
                 float(np.sqrt(np.mean(t.force[~t.free, d] ** 2))) if (~t.free).any() else None
@@ -258,14 +257,14 @@ def located(world, outcome):
     out, model, t = [], world.model, outcome.found.first
     for recording in outcome.found.smoother.recordings[:3]:
         rows = np.arange(*t.rows(recording).indices(len(t.qpos))[:2])
-        rows = rows[cut.evenly(len(rows), POINTS)]
-        for j, kind, q, v in cut.joint_slices(model):
+        rows = rows[windowing.evenly(len(rows), POINTS)]
+        for j, kind, q, v in windowing.joint_slices(model):
             if v.stop - v.start > 1:
                 continue
             d = v.start
             out.append(
                 {
-                    "joint": cut.joint_name(model, j),
+                    "joint": windowing.joint_name(model, j),
                     "recording": recording.name,
                     "unit": "N" if kind.name == "mjJNT_SLIDE" else "N·m",
                     "time": recording.time[rows - t.first[recording]].tolist(),

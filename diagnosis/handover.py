@@ -12,8 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from diagnosis.estimation import prediction_error, stock
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import prediction_error, stock, windowing
 from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predictions, python_parts
 
 
@@ -31,16 +30,16 @@ class Files:
         """The Files of a setting."""
         xml, forms = world.corrected_xml(setting)
         parts = python_parts(world.model, setting, forms)
-        joints = [cut.joint_name(world.model, j) for j in range(world.model.njnt)]
+        joints = [windowing.joint_name(world.model, j) for j in range(world.model.njnt)]
         return cls(xml, corrected_py(parts, joints) if parts else "", forms)
 
     def predicted(self, nominal, windows):
         """qpos (W, T, nq) of windows, by stock MuJoCo and the script; NaN where there is none."""
         if not self.python:
             return stock.predicted(stock.compiled(self.xml), nominal, windows)
-        out, filled = np.full(cut.measured(windows).shape, np.nan), {}
-        for r in cut.recordings_of(windows):  # where a window begins in a hole
-            qpos, qvel = cut.states(nominal, r)
+        out, filled = np.full(windowing.measured(windows).shape, np.nan), {}
+        for r in windowing.recordings_of(windows):  # where a window begins in a hole
+            qpos, qvel = windowing.states(nominal, r)
             filled[r] = replace(r, qpos=qpos, qvel=qvel)
         windows = [w._replace(recording=filled[w.recording]) for w in windows]
         with tempfile.TemporaryDirectory() as folder:
@@ -70,7 +69,7 @@ class Check:
     def __init__(self, world, recordings, smoother, noise):
         """noise (nv,): of positions, as it is reported, whatever these recordings alone show."""
         self.world, self.recordings, self.smoother = world, recordings, smoother
-        self.windows = prediction_error.consecutive(recordings, cut.HORIZON)
+        self.windows = prediction_error.consecutive(recordings, windowing.HORIZON)
         self.noise = prediction_error.reporting_noise(noise)
         self.trajectory, self.scatter = None, 0.0
 
@@ -81,7 +80,9 @@ class Check:
     def errors(self, files):
         """(error of Files over all channels in noises, {channel: SI})."""
         model = self.world.model
-        return cut.error(model, self.windows, files.predicted(model, self.windows), self.noise)
+        return windowing.error(
+            model, self.windows, files.predicted(model, self.windows), self.noise
+        )
 
     def error(self, files):
         """The contract's error of Files; infinite where they do not run."""

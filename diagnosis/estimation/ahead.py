@@ -9,7 +9,7 @@ predicted
 import numpy as np
 
 from diagnosis.effects.base import runge_kutta
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
 FEWEST = 16  # windows that there should be, if shorter ones make up for it
@@ -22,10 +22,10 @@ def cut_ahead(recordings, longest=HORIZONS[-1]):
     """Windows end to end, as long as the longest horizon, or shorter where that gave fewer than
     FEWEST."""
     seconds = [r.time[-1] - r.time[r.start] for r in recordings]
-    sample = cut.sampling(recordings)
+    sample = windowing.sampling(recordings)
     longest = max(min(longest, sum(seconds) / FEWEST), 12 * sample)
-    windows = [w for r in recordings for w in cut.consecutive(r, longest, r.start)]
-    return [windows[i] for i in cut.evenly(len(windows), MOST)]
+    windows = [w for r in recordings for w in windowing.consecutive(r, longest, r.start)]
+    return [windows[i] for i in windowing.evenly(len(windows), MOST)]
 
 
 class Ahead:
@@ -38,8 +38,8 @@ class Ahead:
 
     def __init__(self, world, windows, noise):
         self.world, self.model, self.windows = world, world.model, windows
-        self.measured = cut.measured(windows)
-        self.known = np.isfinite(cut.difference(self.model, self.measured, self.measured))
+        self.measured = windowing.measured(windows)
+        self.known = np.isfinite(windowing.difference(self.model, self.measured, self.measured))
         self.known[:, 0] = False
         count = self.measured.shape[1]
         ahead = np.full((len(windows), count), np.nan)
@@ -52,15 +52,17 @@ class Ahead:
         self.band[self.band >= len(ends)] = -1
         number = min(GROUPS, len(windows))
         self.group = np.arange(len(windows)) * number // len(windows)
-        self.channels = list(cut.channels(self.model).values())
+        self.channels = list(windowing.channels(self.model).values())
         self.noise, self.step = noise, self.model.opt.timestep
         self.travel = self._travel()
-        self.qpos, self.qvel = cut.recorded_starts(self.model, windows)
+        self.qpos, self.qvel = windowing.recorded_starts(self.model, windows)
 
     def _travel(self):
         start = self.measured[:, :1]
         gone = np.abs(
-            cut.difference(self.model, np.broadcast_to(start, self.measured.shape), self.measured)
+            windowing.difference(
+                self.model, np.broadcast_to(start, self.measured.shape), self.measured
+            )
         )
         gone = np.where(np.isfinite(gone), gone, 0.0).reshape(-1, self.model.nv)
         return np.maximum(
@@ -70,7 +72,7 @@ class Ahead:
 
     def sparse(self, most=SCREENED):
         """An Ahead of some of the windows, for a first look."""
-        some = [self.windows[i] for i in cut.evenly(len(self.windows), most)]
+        some = [self.windows[i] for i in windowing.evenly(len(self.windows), most)]
         return Ahead(self.world, some, self.noise)
 
     def start(self, trajectory):
@@ -90,7 +92,7 @@ class Ahead:
         out = np.empty((n, *self.known.shape))
         for k in range(n):
             with np.errstate(invalid="ignore", over="ignore"):
-                gap = cut.difference(self.model, qpos[k * W : (k + 1) * W], self.measured)
+                gap = windowing.difference(self.model, qpos[k * W : (k + 1) * W], self.measured)
             gap = np.where(np.isfinite(gap), np.clip(gap, -self.travel, self.travel), self.travel)
             out[k] = np.where(self.known, gap, 0.0)
         return out

@@ -13,7 +13,7 @@ is the missing one they are equal, whatever its size.
 
 import numpy as np
 
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import Ahead
 from diagnosis.simulation.rows import RowMap
 
@@ -33,7 +33,7 @@ class Chain(Ahead):
         touched = (trajectory.free[self.rows[:, :-1]] & follows).any(1)
         self.carried, self.touched = follows & ~touched[:, None], np.flatnonzero(touched)
         self.used = np.unique(self.rows[:, :-1][self.carried])
-        beside = cut.difference(self.model, trajectory.qpos[self.rows], self.measured)
+        beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
         self.beside = np.where(self.known, beside, 0.0)
         self.whole = self._begun(self.windows)
         self.contacts = self._begun([self.windows[i] for i in self.touched])
@@ -95,7 +95,7 @@ class Chain(Ahead):
         self.map = RowMap(self.world, list(t.first), setting, like=self.map)
         index, none = np.searchsorted(self.map.begin, rows), np.zeros((len(rows), self.model.nv))
         qpos, qvel = self.map.ahead(index, t.qpos[rows], t.qvel[rows], none)
-        gap = cut.difference(self.model, qpos, t.qpos[rows + 1])
+        gap = windowing.difference(self.model, qpos, t.qpos[rows + 1])
         return np.concatenate([gap, t.qvel[rows + 1] - qvel], 1)
 
     def _grown(self, missing):

@@ -7,7 +7,7 @@ measured
 import mujoco
 import numpy as np
 
-from diagnosis.estimation.windows import channels, difference, joint_slices, pooled
+from diagnosis.estimation.windowing import channels, difference, joint_slices, pooled
 
 ORDERS = range(
     2, 7

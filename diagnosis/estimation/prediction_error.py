@@ -10,7 +10,7 @@ noise.
 
 import numpy as np
 
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 
 DRAWS = 4  # of noise, for what a perfect simulator would miss
 
@@ -18,18 +18,18 @@ DRAWS = 4  # of noise, for what a perfect simulator would miss
 def predict(world, settings, windows, begun=None):
     """qpos (W, T, nq) and qvel (W, T, nv) of every window from its recorded start, or from the
     given ones."""
-    qpos, qvel = cut.recorded_starts(world.model, windows) if begun is None else begun
+    qpos, qvel = windowing.recorded_starts(world.model, windows) if begun is None else begun
     return world.simulate([settings] * len(windows), qpos, qvel, windows)
 
 
 def consecutive(recordings, horizon):
-    return [w for r in recordings for w in cut.consecutive(r, horizon, r.start)]
+    return [w for r in recordings for w in windowing.consecutive(r, horizon, r.start)]
 
 
 def prediction_error(world, settings, recordings, noise):
     """(error over all channels in noises, {channel: error in SI})."""
-    windows = consecutive(recordings, cut.HORIZON)
-    return cut.error(world.model, windows, predict(world, settings, windows)[0], noise)
+    windows = consecutive(recordings, windowing.HORIZON)
+    return windowing.error(world.model, windows, predict(world, settings, windows)[0], noise)
 
 
 def floor_error(world, settings, smoother, trajectory, noise):
@@ -41,7 +41,7 @@ def floor_error(world, settings, smoother, trajectory, noise):
     square = np.where(known, gap**2, 0.0)
     per_channel = {
         name: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
-        for name, dofs in cut.channels(world.model).items()
+        for name, dofs in windowing.channels(world.model).items()
         if known[..., dofs].any()
     }
     total, count = (square / noise**2).sum((1, 2)).reshape(DRAWS, -1), max(known.sum(), 1)
@@ -51,7 +51,7 @@ def floor_error(world, settings, smoother, trajectory, noise):
     return float(np.sqrt(total.sum() / count)), per_channel, float(scatter)
 
 
-def floor_gaps(world, settings, smoother, trajectory, horizon=cut.HORIZON):
+def floor_gaps(world, settings, smoother, trajectory, horizon=windowing.HORIZON):
     """What a perfect simulator would miss in the windows, or some of many: (DRAWS W, T, nv), NaN
     where nothing was measured.
 
@@ -72,17 +72,25 @@ def floor_gaps(world, settings, smoother, trajectory, horizon=cut.HORIZON):
     seconds = np.array(
         [w.recording.time[w.first + 1] - w.recording.time[e.first] for w, e in zip(windows, early)]
     )
-    known = np.isfinite(cut.difference(model, cut.measured(windows), cut.measured(windows)))
+    known = np.isfinite(
+        windowing.difference(model, windowing.measured(windows), windowing.measured(windows))
+    )
     measured = np.array([np.isfinite(w.recording.qvel[w.first]) for w in windows])
     spread, out = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0), []
     for _ in range(DRAWS):
-        noisy = cut.integrate(model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,)))
-        start = cut.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds[:, None]
+        noisy = windowing.integrate(
+            model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,))
+        )
+        start = (
+            windowing.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds[:, None]
+        )
         start = np.where(measured, speed[every, at] + spread * rng.normal(size=start.shape), start)
         predicted = predict(world, settings, windows, (noisy[every, at], start))[0]
         rows = np.minimum(np.arange(predicted.shape[1]) + at[:, None], noisy.shape[1] - 1)
         out.append(
-            np.where(known, cut.difference(model, predicted, noisy[every[:, None], rows]), np.nan)
+            np.where(
+                known, windowing.difference(model, predicted, noisy[every[:, None], rows]), np.nan
+            )
         )
     return np.concatenate(out)
 
@@ -92,7 +100,7 @@ def reporting_noise(position_noise):
     return np.where(np.isfinite(position_noise), np.maximum(position_noise, 1e-12), 1.0)
 
 
-def curve(world, settings, smoother, trajectory, noise, longest=3 * cut.HORIZON, points=15):
+def curve(world, settings, smoother, trajectory, noise, longest=3 * windowing.HORIZON, points=15):
     """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t
     up to `longest`.
 
@@ -103,13 +111,14 @@ def curve(world, settings, smoother, trajectory, noise, longest=3 * cut.HORIZON,
     seconds = [w.recording.time[w.first : w.last + 1] - w.recording.time[w.first] for w in windows]
     sample = np.median([s[-1] / (len(s) - 1) for s in seconds])
     most = max(1, round(max(s[-1] for s in seconds) / sample))
-    measured = cut.measured(windows)
-    known = np.isfinite(cut.difference(world.model, measured, measured))
+    measured = windowing.measured(windows)
+    known = np.isfinite(windowing.difference(world.model, measured, measured))
     predicted = {
         name: predict(world, s, windows)[0] for name, s in (("before", {}), ("after", settings))
     }
     gaps = {
-        name: cut.position_residual(world.model, windows, qpos) for name, qpos in predicted.items()
+        name: windowing.position_residual(world.model, windows, qpos)
+        for name, qpos in predicted.items()
     }
     gaps["floor"] = floor_gaps(world, settings, smoother, trajectory, longest)
     out = []
@@ -160,16 +169,16 @@ def traces(world, settings, recordings):
     predictions break (NaN) at window starts."""
     out, model = [], world.model
     for recording in recordings[:3]:
-        windows = cut.consecutive(recording, cut.HORIZON, recording.start)
+        windows = windowing.consecutive(recording, windowing.HORIZON, recording.start)
         lines = [_stitched(predict(world, s, windows)[0], windows) for s in ({}, settings)]
         rows = np.concatenate([np.arange(w.first, w.last + 1) for w in windows])
-        for j, _, q, _ in cut.joint_slices(model):
+        for j, _, q, _ in windowing.joint_slices(model):
             for i in range(q.start, q.stop):
                 if not np.isfinite(recording.qpos[:, i]).any():
                     continue
                 name = (
                     "qpos:"
-                    + cut.joint_name(model, j)
+                    + windowing.joint_name(model, j)
                     + (f":{i - q.start}" if q.stop - q.start > 1 else "")
                 )
                 out.append(

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.effects.environment import touchable
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 from diagnosis.estimation.kalman import smooth
 from diagnosis.estimation.noise import measurement_noise
 from diagnosis.simulation.rows import RowMap
@@ -68,10 +68,10 @@ class Smoother:
         lengths = [len(r.time) for r in recordings]
         starts = np.cumsum([0] + lengths)
         self.first = dict(zip(self.recordings, (int(a) for a in starts[:-1])))
-        states = [cut.states(model, r) for r in recordings]
+        states = [windowing.states(model, r) for r in recordings]
         self.qpos, self.qvel = (np.concatenate(x) for x in zip(*states))
         measured_q = np.concatenate([r.qpos for r in recordings])
-        self.position = cut.difference(
+        self.position = windowing.difference(
             model, self.qpos, np.where(np.isfinite(measured_q), self.qpos, np.nan)
         )
         self.velocity = np.concatenate([_measured_velocity(model, r) for r in recordings])
@@ -108,15 +108,18 @@ class Smoother:
         nv, out = self.model.nv, np.sqrt(self.R)
         known = np.isfinite(np.concatenate([self.position, self.velocity], 1)).any(0)
         out = np.where(known & self.told, out, np.inf)
-        for dofs in cut.channels(self.model).values():
-            out[dofs], out[nv + dofs] = cut.pooled(out[dofs]), cut.pooled(out[nv + dofs])
+        for dofs in windowing.channels(self.model).values():
+            out[dofs], out[nv + dofs] = (
+                windowing.pooled(out[dofs]),
+                windowing.pooled(out[nv + dofs]),
+            )
         return out[:nv], out[nv:]
 
     def _scale(self):
         """Usual generalized force in each dof (nv,): what holds it and what turns it round in 0.2
         s."""
         model, data = self.model, mujoco.MjData(self.model)
-        some, held = cut.evenly(len(self.qpos), 200), []
+        some, held = windowing.evenly(len(self.qpos), 200), []
         for row in some:
             data.qpos[:], data.qvel[:] = self.qpos[row], self.qvel[row]
             mujoco.mj_forward(model, data)
@@ -145,7 +148,7 @@ class Smoother:
                 found.state[live],
                 np.sqrt(found.variance[live]),
             )
-            qpos = cut.integrate(self.model, qpos, state[:, :nv])
+            qpos = windowing.integrate(self.model, qpos, state[:, :nv])
             qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
         self.position_noise, self.velocity_noise = self._noise()
         sd = np.split(deviation, 3, axis=1)
@@ -177,14 +180,14 @@ class Smoother:
         n, after = len(q), np.flatnonzero(now) + 1
         with np.errstate(invalid="ignore", over="ignore"):
             drift = np.concatenate(
-                [cut.difference(model, qpos[after], q), v - qvel[after]], axis=1
+                [windowing.difference(model, qpos[after], q), v - qvel[after]], axis=1
             ) - np.einsum("nij,nj->ni", B, force[now])
         bad = free[now] | ~np.isfinite(drift).all(1) | ~np.isfinite(A).all((1, 2))
         seconds = rows.seconds[bad]
         A[bad], B[bad] = np.eye(2 * nv), 0.0
         A[bad, :nv, nv:] = np.eye(nv) * seconds[:, None, None]
-        glide = cut.integrate(model, qpos[now][bad], qvel[now][bad] * seconds[:, None])
-        drift[bad, :nv] = cut.difference(model, qpos[after][bad], glide)
+        glide = windowing.integrate(model, qpos[now][bad], qvel[now][bad] * seconds[:, None])
+        drift[bad, :nv] = windowing.difference(model, qpos[after][bad], glide)
         drift[bad, nv:] = qvel[now][bad] - qvel[after][bad]
         extra = np.zeros((n, nv))
         jump = np.diff(self.qvel, axis=0)[np.flatnonzero(now)]
@@ -207,7 +210,9 @@ class Smoother:
         noise[..., nv : 2 * nv] = extra[at]
         noise[..., 2 * nv :] = self.walk * seconds[at][..., None]
         noise[~follows] = 0.0
-        offset = np.concatenate([cut.difference(self.model, qpos, self.qpos), self.qvel - qvel], 1)
+        offset = np.concatenate(
+            [windowing.difference(self.model, qpos, self.qpos), self.qvel - qvel], 1
+        )
         y = np.concatenate([offset[:, :nv] + self.position, self.velocity - qvel], 1)
         y = np.where(self.live[..., None], y[self.index], np.nan)
         first = self.index[0]
@@ -234,7 +239,7 @@ def _measured_velocity(model, recording):
     """qvel (T, nv) of a recording, NaN where it is not measured: of joints whose velocities are
     filtered differences of the positions, which are late and tell nothing more."""
     qvel, quality = np.array(recording.qvel, float), recording.quality
-    for j, _, _, v in cut.joint_slices(model):
-        if quality and cut.joint_name(model, j) in quality.differenced:
+    for j, _, _, v in windowing.joint_slices(model):
+        if quality and windowing.joint_name(model, j) in quality.differenced:
             qvel[:, v] = np.nan
     return qvel

@@ -7,7 +7,7 @@ qpos = predicted(model, nominal, windows)        # (W, T, nq) in the nominal mod
 import mujoco
 import numpy as np
 
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 from diagnosis.simulation.editable_model import FILTERS
 
 
@@ -33,12 +33,12 @@ def predicted(model, nominal, windows, step=None):
         int,
     )
     inputs = nominal.actuator_ctrladr[: nominal.nactuator]
-    measured = cut.measured(windows)
+    measured = windowing.measured(windows)
     out = np.full(measured.shape, np.nan)
-    begun = cut.recorded_starts(nominal, windows)
+    begun = windowing.recorded_starts(nominal, windows)
     step = step or (lambda model, data: mujoco.mj_step(model, data))
     length = model.opt.timestep
-    for recording in cut.recordings_of(windows):
+    for recording in windowing.recordings_of(windows):
         mine = {w.first: k for k, w in enumerate(windows) if w.recording is recording}
         last = max(windows[k].last for k in mine.values())
         data, now, start = mujoco.MjData(model), None, 0
@@ -81,7 +81,7 @@ def _hold(model, data, drives, control):
 def addresses(nominal, model):
     """(qpos, dof) addresses in `model` of the nominal model's joints, by name."""
     qpos, dof = [], []
-    for j, _, q, v in cut.joint_slices(nominal):
+    for j, _, q, v in windowing.joint_slices(nominal):
         joint = model.joint(nominal.joint(j).name)
         qpos += range(joint.qposadr[0], joint.qposadr[0] + q.stop - q.start)
         dof += range(joint.dofadr[0], joint.dofadr[0] + v.stop - v.start)

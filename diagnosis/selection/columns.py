@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 from diagnosis.selection.plausibility import plausible
 
 TOGETHER = 40  # settings that are simulated in one call
@@ -145,7 +145,7 @@ class Columns:
         one."""
         t, world = self.trajectory, self.world
         rows = np.flatnonzero(~t.free)
-        rows = rows[cut.evenly(len(rows), STATES)]
+        rows = rows[windowing.evenly(len(rows), STATES)]
         if not len(rows):
             return whole
         engine = world.engine(frozenset([candidate])).working

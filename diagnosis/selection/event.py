@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diagnosis.common.distributions import t_ppf
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 
 SPAN = 0.2  # s, of a window
 LONGER = 2.5  # of it, windows in which ends and values are fitted
@@ -49,7 +49,7 @@ class Windows:
         """trajectory: a smoother.Trajectory under the setting; noise (nv,): of the positions."""
         self.world, self.setting, self.windows = world, setting, windows
         self.qpos, self.qvel = trajectory.at(windows)
-        self.measured, self.noise = cut.measured(windows), noise
+        self.measured, self.noise = windowing.measured(windows), noise
         self.residual = self._raw([setting])[0]
         small = np.concatenate([1e-5 * np.ones_like(noise), 1e-4 * np.ones_like(noise)])
         slopes = [
@@ -66,13 +66,14 @@ class Windows:
         model, n = self.world.model, len(settings)
         moved = np.zeros(2 * model.nv) if moved is None else moved
         qpos = np.tile(
-            cut.integrate(model, self.qpos, np.tile(moved[: model.nv], (len(self.qpos), 1))), (n, 1)
+            windowing.integrate(model, self.qpos, np.tile(moved[: model.nv], (len(self.qpos), 1))),
+            (n, 1),
         )
         qvel = np.tile(self.qvel + moved[model.nv :], (n, 1))
         each = [s for s in settings for _ in self.windows]
         path = self.world.simulate(each, qpos, qvel, self.windows * n)[0]
         with np.errstate(invalid="ignore", over="ignore"):
-            gap = cut.difference(model, path, np.tile(self.measured, (n, 1, 1))) / self.noise
+            gap = windowing.difference(model, path, np.tile(self.measured, (n, 1, 1))) / self.noise
         return np.where(np.isfinite(gap), gap, 0.0).reshape(n, len(self.windows), -1)
 
     def left(self, settings):
@@ -114,7 +115,7 @@ class Local:
         owner = [w.recording for w in scene.windows]
         near = [i for i in range(a - 2, b + 3) if 0 <= i < len(owner) and owner[i] is owner[a]]
         first, end = scene.windows[near[0]].first, scene.windows[near[-1]].last + 1
-        longer = cut.consecutive(owner[a], LONGER * SPAN, first, end)
+        longer = windowing.consecutive(owner[a], LONGER * SPAN, first, end)
         self.scene, self.chi2, self.inside = scene, chi2, slice(a, b + 1)
         self.local = Windows(scene.world, scene.setting, longer, trajectory, scene.noise)
         self.around = float((self.local.left([scene.setting]) ** 2).sum())

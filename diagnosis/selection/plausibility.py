@@ -11,7 +11,7 @@ import numpy as np
 from diagnosis.effects.actuators import ActuatorEffect
 from diagnosis.effects.base import joints_of
 from diagnosis.effects.bodies import size_of
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 
 TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 
@@ -119,9 +119,11 @@ class Usual:
 
     def __init__(self, world, recordings, force):
         model = world.model
-        states = [cut.states(model, r) for r in recordings]
+        states = [windowing.states(model, r) for r in recordings]
         qvel = np.concatenate([v for _, v in states])
-        gone = [cut.difference(model, np.broadcast_to(model.qpos0, q.shape), q) for q, _ in states]
+        gone = [
+            windowing.difference(model, np.broadcast_to(model.qpos0, q.shape), q) for q, _ in states
+        ]
         gone = np.concatenate(gone)
         self.model, self.force, self.recordings = model, force, recordings
         self.speed = np.sqrt(np.mean(qvel**2, axis=0)) + 1e-9

@@ -13,8 +13,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.effects.base import SLIDE
-from diagnosis.estimation import groups, prediction_error
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import groups, prediction_error, windowing
 from diagnosis.estimation.noise import difference_noise
 from diagnosis.selection import transients
 from diagnosis.simulation.rows import RowMap
@@ -118,10 +117,10 @@ def errors(world, settings, recordings):
     """
     known, windows, out = (
         recorded(world.model, recordings),
-        prediction_error.consecutive(recordings, cut.HORIZON),
+        prediction_error.consecutive(recordings, windowing.HORIZON),
         {},
     )
-    begun = cut.recorded_starts(world.model, windows) if known else None
+    begun = windowing.recorded_starts(world.model, windows) if known else None
     predicted = (
         {
             k: world.simulate([s] * len(windows), *begun, windows, sensors=True)[2]

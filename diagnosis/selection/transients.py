@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.common.distributions import chi2_ppf, f_sf
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import PRICE, complexity
 from diagnosis.selection.event import SPAN, Local, Look, Windows, solved
 from diagnosis.selection.unmodelled_force import dependences
@@ -42,7 +42,7 @@ def find(world, recordings, setting, trajectory, noise):
     trajectory: a smoother.Trajectory under the setting {Candidate: values}; noise (nv,): of the
     positions.
     """
-    windows = [w for r in recordings for w in cut.consecutive(r, SPAN, r.start)]
+    windows = [w for r in recordings for w in windowing.consecutive(r, SPAN, r.start)]
     number = len(windows)
     if number < 12:
         return None

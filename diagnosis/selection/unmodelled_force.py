@@ -14,7 +14,7 @@ import numpy as np
 from diagnosis.effects.base import HINGE, SLIDE
 from diagnosis.effects.drives import drives_of
 from diagnosis.effects.unmodelled import asked
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 
 KNOTS = 9
 BLOCKS = 16  # stretches of time that are left out in turn
@@ -49,7 +49,7 @@ def dependences(world, trajectory, recordings, most=4):
     for j in range(model.njnt):
         if model.jnt_type[j] not in (HINGE, SLIDE) or keep.sum() < 10 * KNOTS:
             continue
-        name, d = cut.joint_name(model, j), model.jnt_dofadr[j]
+        name, d = windowing.joint_name(model, j), model.jnt_dofadr[j]
         force = trajectory.force[keep, d]
         size = 1.4826 * np.median(abs(force)) + 1e-300
         force = np.clip(force, -CLIP * size, CLIP * size)
@@ -72,7 +72,7 @@ def _axes(model, trajectory, ctrl, time):
     axes = {"time": time}
     for j in range(model.njnt):
         if model.jnt_type[j] in (HINGE, SLIDE):
-            name = cut.joint_name(model, j)
+            name = windowing.joint_name(model, j)
             axes[f"position:{name}"] = trajectory.qpos[:, model.jnt_qposadr[j]]
             axes[f"velocity:{name}"] = trajectory.qvel[:, model.jnt_dofadr[j]]
     for a in range(model.nactuator):
@@ -85,7 +85,7 @@ def _axes(model, trajectory, ctrl, time):
 def _factors(model, trajectory, ctrl, j, variable):
     """{factor: (rows,)} of what a curve over a variable may be multiplied by: of the joint's own
     and of time, the sign of its speed, as friction has, and what its drives are asked for."""
-    name, out = cut.joint_name(model, j), {None: np.ones(len(ctrl))}
+    name, out = windowing.joint_name(model, j), {None: np.ones(len(ctrl))}
     d = model.jnt_dofadr[j]
     if variable in ("time", f"position:{name}"):
         speed, sd = trajectory.qvel[:, d], np.maximum(trajectory.qvel_sd[:, d], 1e-9)
@@ -143,7 +143,7 @@ def _explained(force, x, times, block, variable, wave=False):
 
 def _quarter(force, x, times):
     """(zero, a quarter of the period) of the wave over x that is most like a force."""
-    some = cut.evenly(len(x), SAMPLED)
+    some = windowing.evenly(len(x), SAMPLED)
     low, high = np.quantile(x, [0.005, 0.995])
     number = np.arange(*WAVES) * 2 * np.pi / max(high - low, 1e-9)
     turned = np.exp(1j * np.outer(number, x[some])) * times[some]

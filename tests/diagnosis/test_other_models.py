@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from diagnosis import command as diagnose
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.noise import difference_noise, measurement_noise
 from diagnosis.estimation.smoother import Smoother
@@ -113,8 +113,8 @@ def test_a_corrected_model_can_be_diagnosed_again(tmp_path):
         np.full((300, 2), np.nan),
         np.zeros((300, 1)),
     )
-    some = cut.consecutive(run, 0.3)
-    qpos, _ = again.simulate([{}] * len(some), *cut.recorded_starts(again.model, some), some)
+    some = windowing.consecutive(run, 0.3)
+    qpos, _ = again.simulate([{}] * len(some), *windowing.recorded_starts(again.model, some), some)
     assert np.isfinite(qpos[:, :10]).all()
 
 
@@ -215,7 +215,7 @@ def same_motion(world, setting, qpos, qvel, seconds=0.4):
         held,
     )
     here = world.simulate(
-        [setting], np.array([qpos]), np.array([qvel]), [cut.Window(run, 0, len(time) - 1)]
+        [setting], np.array([qpos]), np.array([qvel]), [windowing.Window(run, 0, len(time) - 1)]
     )[0][0]
     model = mujoco.MjModel.from_xml_string(world.corrected_xml(setting)[0])
     data, there = mujoco.MjData(model), []
@@ -472,11 +472,11 @@ def test_a_component_that_stands_still_does_not_silence_its_channel():
 
 def test_a_hole_across_which_the_quaternion_turns_its_sign():
     model, run = tumbling()
-    whole = cut.states(model, run)
+    whole = windowing.states(model, run)
     run.qpos[100:110, 3:] = np.nan
     run.qpos[110:, 3:] *= -1
-    qpos, qvel = cut.states(model, run)
-    assert np.abs(cut.difference(model, whole[0], qpos)).max() < 0.02
+    qpos, qvel = windowing.states(model, run)
+    assert np.abs(windowing.difference(model, whole[0], qpos)).max() < 0.02
     assert np.abs((whole[1] - qvel)[[99, 110], 3:]).max() < 1.0
 
 

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import World
@@ -104,7 +104,7 @@ def test_states_are_better_than_measured_and_their_bands_hold():
     assert np.sqrt(np.mean(error**2)) < 0.8 * NOISE
     assert 0.88 < (abs(error) < 1.96 * found.qpos_sd).mean() < 0.995
     assert 0.88 < (abs(speed) < 1.96 * found.qvel_sd).mean() <= 1.0
-    windows = cut.consecutive(run)
+    windows = windowing.consecutive(run)
     qpos, qvel = found.at(windows)
     np.testing.assert_array_equal(qpos[3], found.qpos[windows[3].first])
     np.testing.assert_array_equal(qvel[3], found.qvel[windows[3].first])

@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnosis.estimation import stock
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import stock, windowing
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import World
 
@@ -35,10 +34,10 @@ def test_files_predict_what_was_fitted(setting):
         Recording(f"{k}.csv", time, qpos + 0.1 * k, np.full((151, 2), np.nan), ctrl)
         for k in range(2)
     ]
-    windows = [w for r in runs for w in cut.consecutive(r)]
+    windows = [w for r in runs for w in windowing.consecutive(r)]
     model = stock.compiled(world.corrected_xml(setting)[0])
     found = stock.predicted(model, world.model, windows)
-    starts = cut.recorded_starts(world.model, windows)
+    starts = windowing.recorded_starts(world.model, windows)
     expected = world.simulate([setting] * len(windows), *starts, windows)[0]
     assert found.shape == expected.shape
     np.testing.assert_allclose(found, expected, atol=2e-5)

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnosis.estimation import windows as cut
+from diagnosis.estimation import windowing
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.selection import sensor_faults
@@ -73,7 +73,7 @@ def test_errors_are_those_of_stock_mujoco():
     found = sensor_faults.errors(
         here, {here.candidate("viscous_damping", "a"): (0.2,)}, [recording]
     )
-    qpos, qvel = cut.states(here.model, recording)
+    qpos, qvel = windowing.states(here.model, recording)
     for look, damping in (("before", 0.05), ("after", 0.2)):
         model, squares = mujoco.MjModel.from_xml_string(ARM.format(damping=damping)), []
         for first in range(0, 570, 30):
