@@ -20,6 +20,7 @@ HIGH, FAST = (
     # order of differences that leave nothing of fast motion; noises, of which white noise spans 4.7
     # between the quantiles
 )
+LEAST_SWING = 1.0  # degrees: who moves less by its targets did not record degrees by mistake
 ENOUGH = "10 s of varied motion sampled at 50 Hz or more is a good start"
 
 
@@ -412,6 +413,9 @@ def _check_targets(recording, model):
         if known.sum() < 20 or not target.any() or not q.any():
             continue
         ratio = np.sqrt((target @ target) / (q @ q))
+        swing = max(np.std(target), np.std(q))  # of what would be in degrees
+        if swing < LEAST_SWING:  # a weak servo in resonance, or one that others move
+            continue
         if _alike(target, q) > 0.8 and (0.7 < ratio / 57.3 < 1.4 or 0.7 < ratio * 57.3 < 1.4):
             which = ("target", "position") if ratio > 1 else ("position", "target")
             raise RecordingError(

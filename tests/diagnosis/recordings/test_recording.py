@@ -638,3 +638,23 @@ def test_fuzz_values(tmp_path, model, rows, clock):
         table[:, 0] = 0.02 * np.arange(len(table))
     read_or_refuse(put(tmp_path, text(table)), model)
     read_or_refuse(put(tmp_path, archive(**whole(table)), "run.npz"), model)
+
+
+@pytest.mark.parametrize("swing, refused", [(0.3, False), (20.0, True)])
+def test_positions_far_beyond_their_targets_are_degrees_only_where_they_swing_by_degrees(
+    swing, refused
+):
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="link")
+    body.add_joint(name="j", axis=[0, 1, 0])
+    body.add_geom(size=[0.05, 0, 0], pos=[0, 0, -0.3])
+    servo = spec.add_actuator(name="s", target="j", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    servo.set_to_position(kp=5.0)
+    model, time = spec.compile(), 0.01 * np.arange(400)
+    position = swing * np.sin(3 * time)[:, None]
+    recording = Recording("run.csv", time, position, np.full((400, 1), np.nan), position / 57.3, {})
+    if refused:
+        with pytest.raises(RecordingError, match="degrees beside its targets in rad"):
+            check([recording], model)
+    else:
+        check([recording], model)
