@@ -16,8 +16,8 @@ from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
-from diagnosis.selection.criterion import paired
-from diagnosis.selection.identification import Found, Identification
+from diagnosis.selection.criterion import PRICE, freedom, paired
+from diagnosis.selection.identification import LEVEL, Found, Identification
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
 
@@ -97,13 +97,17 @@ def _checked(search, found, fitted, others, log):
     left = unmodelled_force.dependences(world, trajectory, train)
     for rest in left[:2]:
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=2)
-        if not search.earned(fitted, beside, len(search.candidates)):
+        # where no name is left, a force without one need not pay for being no name
+        gain = paired(fitted.score, beside.score)
+        price = PRICE * freedom(rest.candidate)
+        if gain.gain < price or gain.p_value > LEVEL / len(search.candidates):
             continue
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         size = _force(found, trajectory, world, rest.joint)
         if not mine or rest.size > INSTEAD * size:
-            fitted = search.pruned(judge, beside)
+            fitted = search.pruned(judge, beside) if mine else beside
+        if rest.candidate in fitted.setting:
             break
         if rest.size > NEAREST * size:
             adequacy |= {c: rest for c in mine}

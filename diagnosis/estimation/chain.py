@@ -26,10 +26,11 @@ class Chain(Ahead):
         super().start(trajectory)
         self.trajectory, self.map = trajectory, None
         last = np.array([w.last - w.first for w in self.windows])
-        first = np.array([trajectory.first[w.recording] + w.first for w in self.windows])
+        first = trajectory.begin(self.windows)
         ahead = np.arange(self.known.shape[1])
         self.rows = first[:, None] + np.minimum(ahead, last[:, None])
         follows = ahead[:-1] < last[:, None]
+        self.begin = np.unique(self.rows[:, :-1][follows])
         touched = (trajectory.free[self.rows[:, :-1]] & follows).any(1)
         self.carried, self.touched = follows & ~touched[:, None], np.flatnonzero(touched)
         self.used = np.unique(self.rows[:, :-1][self.carried])
@@ -50,7 +51,7 @@ class Chain(Ahead):
         """Measured less predicted, (settings, W, T, nv), as of Ahead."""
         out = np.zeros((len(settings), *self.known.shape))
         if len(self.used):
-            plain = [{c: v for c, v in s.items() if not self._apart(c)} for s in settings]
+            plain = [{c: v for c, v in s.items() if not self.apart(c)} for s in settings]
             self._along(plain, out)
             self._beyond(settings, plain, out)
         if self.contacts:
@@ -65,7 +66,7 @@ class Chain(Ahead):
         for row, setting in zip(out, settings):
             key = frozenset(setting.items())
             if key not in done:
-                done[key] = self._grown(self._missing(setting))
+                done[key] = self._grown(self.missing(setting, self.used))
             row[:] = done[key]
 
     def _beyond(self, settings, plain, out):
@@ -79,19 +80,16 @@ class Chain(Ahead):
         for k, gap in zip(more, both):
             out[k] += gap - without[frozenset(plain[k].items())]
 
-    def _apart(self, candidate):
+    def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""
         effect = candidate.effect
         if candidate.when or effect.overrides("measure") or effect.name == "time_step":
             return True
-        if not effect.overrides("build"):
-            return False
-        engine = self.world.engine(frozenset([candidate]))
-        return engine.model.nv > self.model.nv or bool(engine.hidden.any())
+        return self.world.adds_states(candidate)
 
-    def _missing(self, setting):
-        """(used rows, 2 nv): the measured motion less the predicted one, a row on."""
-        t, rows = self.trajectory, self.used
+    def missing(self, setting, rows):
+        """(rows, 2 nv): the smoothed motion less the predicted one, a row on, of rows (n,)."""
+        t = self.trajectory
         self.map = RowMap(self.world, list(t.first), setting, like=self.map)
         index, none = np.searchsorted(self.map.begin, rows), np.zeros((len(rows), self.model.nv))
         qpos, qvel = self.map.ahead(index, t.qpos[rows], t.qvel[rows], none)

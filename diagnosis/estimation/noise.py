@@ -9,11 +9,8 @@ import numpy as np
 
 from diagnosis.estimation.windowing import channels, difference, joint_slices, pooled
 
-ORDERS = range(
-    2, 7
-)  # of differences: what a smooth motion leaves falls with the order, noise does not
-STRIDES = 1, 2, 4  # rows apart: noise that was filtered before it was stored shows in coarser rows
-WHITE = 0.6  # ratio of the last to the second estimate, above which noise is taken to be white
+# of differences: what a smooth motion leaves falls with the order, noise does not
+ORDERS = range(2, 9)
 
 
 def quantum(column):
@@ -39,20 +36,16 @@ def difference_noise(time, column):
     time, column, best = time[known], column[known], np.inf
     if not len(column) or np.ptp(column) == 0:
         return np.inf
-    for stride in STRIDES:
-        estimates = []
-        for order in ORDERS:
-            d = _divided(time[::stride], column[::stride], order)
-            if len(d) < 5:
-                break
-            estimates.append(np.quantile(np.abs(d), 0.8) / 1.2816)
-        if not estimates:
+    estimates = []
+    for order in ORDERS:
+        d = _divided(time, column, order)
+        if len(d) < 5:
             break
+        estimates.append(np.quantile(np.abs(d), 0.8) / 1.2816)
+    if estimates:
         best = min(estimates)
-        if len(estimates) > 2:  # what still falls with the order is motion, and falls on
-            best *= min(1.0, estimates[-1] / estimates[-3]) ** 2
-        if len(estimates) < len(ORDERS) or estimates[-1] > WHITE * estimates[1]:
-            break
+    if len(estimates) > 2:  # what still falls with the order is motion, and falls on
+        best *= min(1.0, estimates[-1] / estimates[-3]) ** 2
     step = quantum(column)
     return max(best, step / np.sqrt(12)) if best or step else np.inf
 

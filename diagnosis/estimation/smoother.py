@@ -50,8 +50,12 @@ class Trajectory:
 
     def at(self, windows):
         """Start states of windows: qpos (W, nq), qvel (W, nv)."""
-        rows = [self.first[w.recording] + w.first for w in windows]
+        rows = self.begin(windows)
         return self.qpos[rows], self.qvel[rows]
+
+    def begin(self, windows):
+        """The first row (W,) of each window."""
+        return np.array([self.first[w.recording] + w.first for w in windows], int)
 
     def rows(self, recording):
         """The slice of a recording's rows."""

@@ -14,12 +14,8 @@ from diagnosis.recordings.columns import WIDTHS, RecordingError, columns_of
 from diagnosis.recordings.layout import is_servo, joint_of
 from diagnosis.recordings.unit_check import suspect
 
-HIGH, FAST = (
-    10,
-    8.0,
-    # order of differences that leave nothing of fast motion; noises, of which white noise spans 4.7
-    # between the quantiles
-)
+HIGH = 10  # order of differences that leave nothing of fast motion
+FAST = 8.0  # noises, of which white noise spans 4.7 between the quantiles
 LEAST_SWING = 1.0  # degrees: who moves less by its targets did not record degrees by mistake
 ENOUGH = "10 s of varied motion sampled at 50 Hz or more is a good start"
 

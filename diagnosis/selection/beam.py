@@ -19,13 +19,18 @@ class Node:
 
     options: tuple
     score: Score
-    cost: float  # of its values, and of its complexity
-    price: float
+    cost: float  # of its values
+    price: float  # of its complexity
+
+    @property
+    def unpriced(self):
+        """What the search goes by: a price paid early hides what two effects do together."""
+        return self.score.loss + self.cost
 
     @property
     def loss(self):
         """What sets are ranked by."""
-        return self.score.loss + self.cost + self.price
+        return self.unpriced + self.price
 
 
 class Beam:
@@ -61,7 +66,7 @@ class Beam:
                     if key in met:
                         continue
                     met[key] = new = self.node(options)
-                    if self._left(new) < self._left(node) - LEAST:
+                    if new.unpriced < node.unpriced - LEAST:
                         grown.append(new)
             if not grown:
                 break
@@ -73,7 +78,7 @@ class Beam:
     def _different(self, nodes):
         """The best node of each set of candidates, best first."""
         best = {}
-        for node in sorted(nodes, key=self._left):
+        for node in sorted(nodes, key=lambda n: n.unpriced):
             candidates = frozenset(self.columns.options[k].candidate for k in node.options)
             best.setdefault(candidates, node)
         return list(best.values())
@@ -89,11 +94,6 @@ class Beam:
                     met[key] = self.node(options)
                 fewer.append(met[key])
             node = min(fewer, key=lambda n: n.loss)
-
-    @staticmethod
-    def _left(node):
-        """What the search goes by: a price paid early hides what two effects do together."""
-        return node.score.loss + node.cost
 
     def gains(self, node):
         """Nats that every option promises beside a node's, in a first look: a list."""

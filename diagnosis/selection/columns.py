@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.estimation import windowing
+from diagnosis.selection.first_look import first_look
 from diagnosis.selection.plausibility import plausible
 
 TOGETHER = 40  # settings that are simulated in one call
@@ -20,6 +21,7 @@ FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column sta
 PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
 STATES = 300  # of the motion, at which forces are compared
+LIKELY = 30  # candidates that are simulated, of those of which a first look tells something
 PROMISING = 3  # groups of starts that are simulated
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
 
@@ -86,20 +88,20 @@ class Columns:
     K); options."""
 
     def __init__(
-        self, ahead, setting, usual, candidates, residual=None, seen=None, trajectory=None
+        self, ahead, setting, usual, candidates, residual=None, seen=None, few=False, curves=()
     ):
         """residual: of the setting, if it is known; seen: {candidate: which of its parameters
-        show}, of earlier looks."""
+        show}, of earlier looks; few: only those of which a first look promises something, ahead
+        being a Chain; curves: [(candidate, values)] of forces without a name."""
         self.ahead, self.setting, self.usual, self.world = ahead, setting, usual, ahead.world
-        self.options, self.simulated = [], int(residual is None)
-        self.trajectory = trajectory
+        self.options, self.simulated, self.few = [], int(residual is None), few
         self.seen = {} if seen is None else seen
         self.residual = ahead.residual([setting])[0] if residual is None else residual
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
-        self.parts, starts = [], []
-        for candidate in candidates:
-            starts += self._starts(candidate)
-        self._simulate(starts)
+        self.parts = []
+        starts = [start for candidate in candidates for start in self._starts(candidate)]
+        starts += [self._whole(candidate, values) for candidate, values in curves]
+        self._simulate(self._likely(starts) if few else starts)
 
     @property
     def array(self):
@@ -124,7 +126,7 @@ class Columns:
         if together == 1 and len(whole) > PROBES:
             some = np.unique(np.linspace(0, len(whole) - 1, PROBES).astype(int))
             whole = [whole[i] for i in some]
-        elif together > 1 and self.trajectory is not None:
+        elif together > 1 and self.few:
             whole = self._promising(candidate, whole)
         for k in range(0, len(whole), together):
             rows = np.array(whole[k : k + together], float)
@@ -140,10 +142,24 @@ class Columns:
                 out.append((candidate, start, directions, low, high, prior, together > 1))
         return out
 
+    def _whole(self, candidate, values):
+        """The start of a curve at the forces that were located."""
+        prior = plausible(candidate, self.usual)
+        low, high = np.array([FULL]).T
+        return candidate, np.zeros(len(values)), np.array([values]), low, high, prior, False
+
+    def _likely(self, starts):
+        """The starts that are worth a column in full: of what is in the setting, of what a first
+        look tells nothing of, and of those that explain most in it."""
+        told = first_look(self.ahead, self.setting, starts)
+        told = {c: share for c, share in told.items() if c not in self.setting}
+        most = set(sorted(told, key=lambda c: -told[c])[:LIKELY])
+        return [start for start in starts if start[0] in most or start[0] not in told]
+
     def _promising(self, candidate, whole):
         """Of starts that come in groups, those of the groups whose force is most like the located
         one."""
-        t, world = self.trajectory, self.world
+        t, world = self.ahead.trajectory, self.world
         rows = np.flatnonzero(~t.free)
         rows = rows[windowing.evenly(len(rows), STATES)]
         if not len(rows):

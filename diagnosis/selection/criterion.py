@@ -23,7 +23,6 @@ SHARE = 0.1
 NOISE = 0.3  # of the noise, that counts as none
 GROSS = 5.0  # a window's error over the median, from which on it counts no more
 ITERATIONS = 3  # of reweighted least squares
-FREEDOM = 3  # parameters of an effect that count: those of a curve are smooth
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
 PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
 
@@ -31,40 +30,48 @@ PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked o
 @dataclass(frozen=True)
 class Score:
     """loss: sum over channels of mean log RMS; groups (G,): the same of each group; amounts (p,):
-    fitted to all."""
+    fitted to all; cells: of a channel in a group, whose errors are taken to be independent."""
 
     loss: float
     groups: np.ndarray
     amounts: np.ndarray
+    cells: float
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """gain: loss removed, in nats of log RMS; spread: its standard error over groups; p_value:
-    one-sided, that it is none."""
+    """gain: loss removed, in nats of log RMS; p_value: one-sided, that it is none."""
 
     gain: float
-    spread: float
     p_value: float
+
+
+def freedom(candidate):
+    """Units of complexity that an effect has for its parameters."""
+    return (1 + len(candidate.parameters)) / 2
 
 
 def complexity(candidates):
     """Of a set of effects: how far each is from the first things to think of, and its freedom."""
-    return sum(
-        1 + c.effect.simplicity + (min(len(c.parameters), FREEDOM) - 1) / 2 for c in candidates
-    )
+    return sum(c.effect.simplicity + freedom(c) for c in candidates)
 
 
 def paired(before, after):
-    """Comparison of two Scores, differences paired by group."""
+    """Comparison of two Scores, differences paired by group.
+
+    What is predicted better by as much everywhere is told by how little the differences scatter (a
+    t-test). What is seen in a few groups alone is told by how much more likely it makes what was
+    left out: by chance a ratio of likelihoods exceeds x in no more than one of x cases. The group
+    that gains most is not counted: one odd window decides nothing.
+    """
     d = before.groups - after.groups
-    n = len(d)
-    told = n > 1 and np.isfinite(d).all()  # not of values that are impossible
-    spread = float(np.std(d, ddof=1) / np.sqrt(n)) if told else np.inf
-    gain = float(before.loss - after.loss)
-    if not spread > 0 or not np.isfinite(spread):
-        return Comparison(gain, spread, 1.0)
-    return Comparison(gain, spread, float(t_sf(d.mean() / spread, n - 1)))
+    n, gain = len(d), float(before.loss - after.loss)
+    if n < 2 or not np.isfinite(d).all():  # values that are impossible tell nothing
+        return Comparison(gain, 1.0)
+    spread = np.std(d, ddof=1) / np.sqrt(n)
+    alike = t_sf(d.mean() / spread, n - 1) if spread > 0 else 1.0
+    nats = (d.sum() - d.max()) * before.cells
+    return Comparison(gain, float(min(alike, np.exp(-max(nats, 0.0)))))
 
 
 class Evidence:
@@ -93,7 +100,6 @@ class Evidence:
                 rows[g, j] = part[here] * root[:, None]
                 self.count[g, j] = len(root)
         self._keep(rows, stack.shape[-1])
-        self.cells = (self.count > 0).any(0)
         square = self.own[:, :, 0] / np.maximum(self.count, 1)
         self.floor = reference
         if reference is None:
@@ -102,7 +108,9 @@ class Evidence:
                 for s, c in zip(square.T, self.count.T)
             ]
             self.floor = np.tile(least + SHARE**2 * np.array(middle) + 1e-30, (groups, 1))
-        self.number = max(self.cells.sum() * groups / max(self.channels, 1), 1)  # cells per channel
+        seen = (self.count > 0).any(0).sum()
+        self.cells = max(seen / max(self.channels, 1), 1 / groups)  # of a channel in a group
+        self.number = self.cells * groups
 
     def _keep(self, rows, width):
         """Keep weighted rows {(group, cell): (n, width)}, columns first, and their squares.
@@ -160,7 +168,7 @@ class Evidence:
         p, amounts, g = len(index) - 1, np.zeros(len(index) - 1), self.products(index)
         if not p:
             groups = self.losses(self._square(g, amounts))
-            return Score(float(groups.mean()), groups, amounts)
+            return Score(float(groups.mean()), groups, amounts, self.cells)
         for _ in range(ITERATIONS):
             each = np.einsum("gc,gcij->gij", self._weight(g, amounts), g)
             whole = each.sum(0)
@@ -169,7 +177,7 @@ class Evidence:
         rest = each.sum(0) - each
         left = each_bounded(rest[:, 1:, 1:] + np.diag(precision), rest[:, 1:, 0] + pull, low, high)
         groups = self.losses(self._square(g, left))
-        return Score(float(groups.mean()), groups, amounts)
+        return Score(float(groups.mean()), groups, amounts, self.cells)
 
     def weight(self, index, amounts):
         """(G, cells): weights of squares at which least squares lowers the sum of logs."""

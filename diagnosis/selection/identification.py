@@ -12,13 +12,15 @@ from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import PRICE, Evidence, complexity, paired
+from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.judge import Fitted, Judge
 from diagnosis.selection.plausibility import Usual
+from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
 IDLE = 1.0  # nats that an effect must promise beside those chosen, to be looked at once more
+SETTLED = 0.025  # loss that other start states still remove, from which on they stay
 ANEW = 4  # times that a set is fitted to start states of its own, at most
 FINALISTS = 4  # sets that the simulator judges in a round
 
@@ -78,9 +80,10 @@ class Identification:
 
     def _round(self, setting):
         """(Fitted, whether it is better than what there was, first ranking)."""
-        candidates = [c for c in self.candidates if c not in self.idle]
+        candidates = [c for c in self.candidates if c not in self.idle and c not in setting]
+        every, curves = [*setting, *candidates], self._curves(setting)
         columns = Columns(
-            self.screen, setting, self.usual, candidates, seen=self.seen, trajectory=self.trajectory
+            self.screen, setting, self.usual, every, seen=self.seen, few=True, curves=curves
         )
         evidence = Evidence(self.screen, columns.residual, columns.array)
         columns.secants(evidence)
@@ -105,7 +108,15 @@ class Identification:
             best = self.pruned(judge, judge.fit(best.setting))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
             self._set_aside(beam, columns, best)
-        return best, best is not now, [] if setting else self._ranking(beam, start)
+        return best, best is not now, [] if setting else self._ranking(beam, start, nodes)
+
+    def _curves(self, setting):
+        """[(candidate, values)] of forces without a name, in joints that no effect of a setting
+        acts at: beside one, every curve is significant, and its size decides in the end."""
+        found = dependences(self.world, self.trajectory, self.train)
+        joints = [self.world.joints(c.place) or () for c in setting]
+        taken = {self.world.model.joint(j).name for some in joints for j in some}
+        return [(d.candidate, d.values) for d in found if d.joint not in taken]
 
     def _begun_anew(self, judge, fitted):
         """(Fitted again, its Judge) from the start states that the recordings have under a set: of
@@ -116,7 +127,7 @@ class Identification:
             trajectory = smoother.locate(fitted.setting, trajectory, passes=1)
             ahead.start(trajectory)
             before, fitted = fitted, again.fit(fitted.setting, steps=2)
-            if k and fitted.loss > before.loss - PRICE / 4:
+            if k and fitted.loss > before.loss - SETTLED:
                 break
         return fitted, again
 
@@ -144,18 +155,13 @@ class Identification:
         return chosen
 
     def _choose(self, judged, now, number):
-        """The simplest set that is as good as the best within what groups scatter, if that earns
-        its place over what there was."""
+        """The simplest set over which the best is not earned, if that is over what there was."""
         judged = [f for f in judged if f is now or f.settled]
         best = min(judged, key=lambda f: f.loss)
         if best is now or not self.earned(now, best, number):
             return now
 
-        def near(fitted):
-            step = paired(fitted.score, best.score)
-            return fitted is best or step.gain < step.spread
-
-        good = [f for f in judged if f is not now and near(f)]
+        good = [f for f in judged if f is best or (f is not now and not self.earned(f, best))]
         return min(good, key=lambda f: (complexity(f.setting), f.loss))
 
     def earned(self, before, after, number=1):
@@ -180,15 +186,15 @@ class Identification:
         return fitted
 
     @staticmethod
-    def _ranking(beam, start):
-        """[(candidate, loss removed alone, p-value)], most first."""
+    def _ranking(beam, start, nodes):
+        """[(candidate, loss removed alone, p-value)], most first, of nodes with the best first."""
         best = {}
-        for k in beam.free:
-            node, c = beam.node((*beam.kept, k)), beam.columns.options[k].candidate
-            gain = start.loss - node.loss
-            if c not in best or gain > best[c][0]:
-                best[c] = gain, paired(start.score, node.score).p_value
-        return sorted(((c, *each) for c, each in best.items()), key=lambda item: -item[1])
+        for node in nodes:
+            if len(node.options) == len(start.options) + 1:
+                candidate = beam.columns.options[node.options[-1]].candidate
+                p = paired(start.score, node.score).p_value
+                best.setdefault(candidate, (candidate, start.loss - node.loss, p))
+        return list(best.values())
 
 
 def said(setting):

@@ -5,7 +5,7 @@ fitted = judge.fit({friction: (0.1,)})
 fitted.setting, fitted.loss
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -62,7 +62,7 @@ class Judge:
                 break
             setting, residual = better
         prior = self.cost(setting) / evidence.number
-        final = Score(score.loss + prior, score.groups + prior, score.amounts)
+        final = replace(score, loss=score.loss + prior, groups=score.groups + prior)
         return Fitted(setting, final, columns, evidence)
 
     def _lower(self, columns, evidence, amounts, setting):

@@ -81,8 +81,8 @@ def _loudest(trajectory, windows):
     """Index of the window with the largest located force, in each joint's usual ones."""
     size = np.median(abs(trajectory.force), axis=0) + 1e-300
     loud = ((trajectory.force / size) ** 2).sum(1)
-    ends = [(trajectory.first[w.recording] + w.first, w.last - w.first + 1) for w in windows]
-    return int(np.argmax([loud[a : a + n].mean() for a, n in ends]))
+    ends = [(a, a + w.last - w.first + 1) for a, w in zip(trajectory.begin(windows), windows)]
+    return int(np.argmax([loud[a:b].mean() for a, b in ends]))
 
 
 def _looks(scene):

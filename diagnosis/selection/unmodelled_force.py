@@ -6,7 +6,6 @@ found.candidate
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -38,6 +37,16 @@ class Dependence:
     values: tuple
 
 
+@dataclass(frozen=True)
+class Curve:
+    """share: of the force's variance, predicted on blocks left out; rms: of the curve's force."""
+
+    share: float
+    rms: float
+    knots: np.ndarray
+    values: np.ndarray
+
+
 def dependences(world, trajectory, recordings, most=4):
     """The Dependences of the located force of every hinge and slide, the largest force first."""
     model, found = world.model, []
@@ -56,7 +65,7 @@ def dependences(world, trajectory, recordings, most=4):
         for variable, x in axes.items():
             for factor, times in _factors(model, trajectory, ctrl, j, variable).items():
                 own = variable == f"position:{name}"
-                for wave in (False, True)[: 1 + own]:
+                for wave in (False, True) if own else (False,):
                     curve = _explained(force, x[keep], times[keep], block, variable, wave)
                     if curve.share > LEAST:
                         candidate = world.curve(name, variable, curve.knots, factor, wave)
@@ -107,15 +116,6 @@ def knots_of(x, variable):
         shape = np.array([-1, -0.5, -0.2, -0.03, 0.0, 0.03, 0.2, 0.5, 1.0])
         return np.unique(np.clip(end * shape, low, high))
     return np.linspace(low, high, KNOTS)
-
-
-class Curve(NamedTuple):
-    """share: of the force's variance, predicted on blocks left out; rms: of the curve's force."""
-
-    share: float
-    rms: float
-    knots: np.ndarray
-    values: np.ndarray
 
 
 def _explained(force, x, times, block, variable, wave=False):

@@ -67,15 +67,12 @@ class Signal:
         return held - self.lag / step * np.diff(act)
 
     def _followed(self, start, step, count, average):
-        """As sample, of a limited rate: its mean over each step, exactly, then the lag of these."""
-        lead = 0
-        if self.lag:  # until what was before does not count any more
-            lead = int(np.ceil(min(start - self.delay - self.time[0], 40 * self.lag) / step))
-            lead = max(lead, 0)
+        """As sample, of a limited rate with a lag: its mean over each step, exactly, then the lag
+        of these."""
+        # until what was before does not count any more
+        lead = max(0, int(np.ceil(min(start - self.delay - self.time[0], 40 * self.lag) / step)))
         edges = start - self.delay + step * np.arange(-lead, count + 1)
         mean = np.diff(self._ramps(edges)) / step
-        if not self.lag:
-            return mean
         steady = Signal(edges[:-1], mean, lag=self.lag)
         return steady.sample(edges[lead], step, count, average)
 

@@ -32,7 +32,7 @@ class RowMap:
         """like: another RowMap of the recordings, whose controls are taken over where they are
         the same."""
         self.world, self.recordings, self.nominal = world, recordings, world.model
-        setting = {c: v for c, v in setting.items() if not c.when and not self._adds(c)}
+        setting = {c: v for c, v in setting.items() if not c.when and not world.adds_states(c)}
         self.case = case = Case(world.model, setting, 1)
         self.working = world.engine(case.structure).working
         model = self.working.edited(case.on, case.step)
@@ -61,13 +61,6 @@ class RowMap:
         return candidate.place.kind == "actuator" and (
             candidate.effect.overrides("command") or candidate.effect.overrides("build")
         )
-
-    def _adds(self, candidate):
-        """Whether an effect adds coordinates or states of its own."""
-        if not candidate.effect.overrides("build"):
-            return False
-        engine = self.world.engine(frozenset([candidate]))
-        return engine.model.nv > self.nominal.nv or bool(engine.hidden.any())
 
     def _controls(self, recording):
         """(rows - 1, count, nu): what the actuators see in the steps after each row."""

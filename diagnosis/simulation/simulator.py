@@ -186,6 +186,13 @@ class World:
             return {m.actuator_trnid[m.actuator(place.name).id, 0]}
         return None
 
+    def adds_states(self, candidate):
+        """Whether an effect brings coordinates (backlash) or states (bristles) of its own."""
+        if not candidate.effect.overrides("build"):
+            return False
+        engine = self.engine(frozenset([candidate]))
+        return engine.model.nv > self.model.nv or bool(engine.hidden.any())
+
     def simulate(self, settings, start_qpos, start_qvel, windows, refine=1, sensors=False):
         """Predict what the sensors show in S windows, each under its own setting.
 

@@ -42,6 +42,13 @@ def test_rows_that_were_lost_make_no_noise():
     assert difference_noise(time, column) == pytest.approx(1e-4, rel=0.15)
 
 
+def test_a_motion_of_few_rows_a_turn_is_no_noise():
+    time = 0.02 * np.arange(151)  # every second row of it would look like noise
+    column = 0.1 * np.sin(2 * np.pi * 4 * time) + 0.03 * np.sin(2 * np.pi * 6 * time)
+    column += 1e-3 * RNG(3).normal(size=151)
+    assert difference_noise(time, column) == pytest.approx(1e-3, rel=0.3)
+
+
 def test_an_encoder_is_no_better_than_its_steps():
     time = 0.01 * np.arange(2000)
     column = 0.002 * np.rint(np.sin(3 * time) / 0.002)
