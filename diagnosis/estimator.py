@@ -30,7 +30,7 @@ STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 @dataclass
 class Outcome:
     """All that the report is made of: found (Found), fitted (Fitted set), trajectory (Trajectory
-    under it), others {Candidate: [(other, values)]}, p_values, adequacy {Candidate: Dependence
+    under it), others {Candidate: [(other, values)]}, p_values, adequacy {Candidate: variables
     left}, strains {Candidate: words}, left ([Dependence] under the final set), dependences (under
     the nominal model), handed (Handed), train_check and held_check (Check)."""
 
@@ -110,7 +110,7 @@ def _checked(search, found, fitted, others, log):
         if rest.candidate in fitted.setting:
             break
         if rest.size > NEAREST * size:
-            adequacy |= {c: rest for c in mine}
+            adequacy |= {c: rest.variables for c in mine}
     others = {c: o for c, o in others.items() if c in fitted.setting}
     p_values = {}
     for out in fitted.setting:

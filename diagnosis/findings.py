@@ -16,6 +16,7 @@ from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults, transients
 
 SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing
+ENOUGH = 0.5  # of the error that findings remove, up to which what is left leaves them adequate
 COLOURED = 3.0  # of its error under white noise, what noise of another kind may reach
 POINTS = 400  # of a located force that are told
 
@@ -54,6 +55,8 @@ def assemble(world, train, held_out, outcome):
     figure = figures["held_out"]
     findings = _findings(world, outcome, bounds, figure)
     left = unexplained(figure["before"], figure["after"], figure["floor"], check.scatter)
+    if not enough(left, figure["before"], figure["after"]):
+        findings = [{**finding, "adequate": False} for finding in findings]
     if not findings and not outcome.earned and figure["after"] < COLOURED * figure["floor"]:
         left = 0.0  # noise that is not white does as much
     hint = outcome.left[0] if outcome.left and left > 0 else None
@@ -122,7 +125,7 @@ def _finding(world, candidate, outcome, bounds, figure):
             "held_out_error_removed": removed(handed.without[candidate], after, before),
             "p_value": outcome.p_values[candidate],
         },
-        "adequate": not curve and rest is None,
+        "adequate": not curve and rest is None and certain(candidate, bounds[candidate]),
         "strains": outcome.strains.get(candidate),
         "depends_on": [v for v in (candidate.effect.variable, candidate.effect.factor) if v]
         if curve
@@ -134,8 +137,20 @@ def _finding(world, candidate, outcome, bounds, figure):
             for c, v in outcome.others.get(candidate, [])
         ],
         **({"curve": form} if curve else {}),
-        **({"rest_depends_on": list(rest.variables)} if rest else {}),
+        **({"rest_depends_on": list(rest)} if rest else {}),
     }
+
+
+def certain(candidate, bounds):
+    """Whether the interval of some value leaves out the nominal one."""
+    seen = [(p, b) for p, b in zip(candidate.parameters, bounds) if b is not None]
+    return any(not low <= p.nominal <= high for p, (low, high) in seen)
+
+
+def enough(left, before, after):
+    """Whether findings explain most of what could be: the error that is left above noise is at most
+    half of what they remove. left: share of the nominal model's squared error."""
+    return not left or left * before**2 <= ENOUGH**2 * max(before**2 - after**2, 0.0)
 
 
 def place_of(candidate):

@@ -23,6 +23,7 @@ SHARE = 0.1
 NOISE = 0.3  # of the noise, that counts as none
 GROSS = 5.0  # a window's error over the median, from which on it counts no more
 ITERATIONS = 3  # of reweighted least squares
+INDEPENDENT = 1.0  # errors of a cell, as which it counts where a few groups decide
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
 PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
 
@@ -30,7 +31,7 @@ PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked o
 @dataclass(frozen=True)
 class Score:
     """loss: sum over channels of mean log RMS; groups (G,): the same of each group; amounts (p,):
-    fitted to all; cells: of a channel in a group, whose errors are taken to be independent."""
+    fitted to all; cells: of a channel in a group."""
 
     loss: float
     groups: np.ndarray
@@ -70,7 +71,7 @@ def paired(before, after):
         return Comparison(gain, 1.0)
     spread = np.std(d, ddof=1) / np.sqrt(n)
     alike = t_sf(d.mean() / spread, n - 1) if spread > 0 else 1.0
-    nats = (d.sum() - d.max()) * before.cells
+    nats = INDEPENDENT * (d.sum() - d.max()) * before.cells
     return Comparison(gain, float(min(alike, np.exp(-max(nats, 0.0)))))
 
 
