@@ -34,7 +34,8 @@ class Trajectory:
     qpos (rows, nq), qvel (rows, nv); force (rows, nv): what the simulator lacks, mean over the row
     that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free
     (rows,): where something touches, and no force is told; transition (rows, 2 nv, 2 nv): to the
-    next row, of small changes; step: the simulator's, s, 0 if unknown.
+    next row, of small changes; step: the simulator's, s, 0 if unknown; driven (rows, 2 nv, nv): by
+    forces, None if unknown.
     """
 
     qpos: np.ndarray
@@ -47,6 +48,7 @@ class Trajectory:
     free: np.ndarray
     transition: np.ndarray
     step: float = 0.0
+    driven: np.ndarray = None
 
     def at(self, windows):
         """Start states of windows: qpos (W, nq), qvel (W, nv)."""
@@ -132,8 +134,12 @@ class Smoother:
         scale = np.mean(held, axis=0) + model.dof_M0 * (speed + 1e-3) / 0.2
         return np.maximum(scale, 1e-3 * scale.max())
 
-    def locate(self, setting, trajectory=None, passes=PASSES):
-        """The Trajectory under a setting {Candidate: values}, begun at another one if given."""
+    def locate(self, setting, trajectory=None, passes=PASSES, near=False):
+        """The Trajectory under a setting {Candidate: values}, begun at another one if given.
+
+        near: to one of a similar setting, whose transitions are taken over, for they cost most:
+        where the motion goes is the setting's all the same.
+        """
         rows = RowMap(self.world, self.recordings, setting)
         if trajectory is None:
             qpos, qvel, force = self.qpos, self.qvel, np.zeros_like(self.qvel)
@@ -141,7 +147,7 @@ class Smoother:
             qpos, qvel, force = trajectory.qpos, trajectory.qvel, trajectory.force
         for _ in range(passes):
             free = self._touching(qpos)
-            step = self._linear(rows, qpos, qvel, force, free)
+            step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
             for _ in range(UPDATES):
                 found = self._smooth(step, qpos, qvel)
                 self._update(found)
@@ -156,9 +162,11 @@ class Smoother:
             qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
         self.position_noise, self.velocity_noise = self._noise()
         sd = np.split(deviation, 3, axis=1)
-        transition = np.tile(np.eye(2 * nv), (len(qpos), 1, 1))
-        transition[~self.last] = step[0][:, : 2 * nv, : 2 * nv]
-        return Trajectory(qpos, qvel, force, *sd, self.first, free, transition, rows.case.step)
+        transition = np.tile(np.eye(2 * nv, 3 * nv), (len(qpos), 1, 1))
+        transition[~self.last] = step[0][:, : 2 * nv]
+        split = np.split(transition, [2 * nv], axis=2)
+        args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
+        return Trajectory(*args)
 
     def _touching(self, qpos):
         """Rows (N,) at or after which something touches; a force there is told by no smooth map."""
@@ -175,12 +183,16 @@ class Smoother:
             touch[row] = data.ncon > 0
         return touch | np.append(touch[1:], False)
 
-    def _linear(self, rows, qpos, qvel, force, free):
+    def _linear(self, rows, qpos, qvel, force, free, like=None):
         """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a
-        trajectory; extra velocity variance."""
+        trajectory, or of another one like it; extra velocity variance."""
         model, nv = self.model, self.model.nv
         now = ~self.last
-        q, v, A, B = rows.linearised(qpos[now], qvel[now], force[now], self.scale, free[now])
+        if like is None:
+            q, v, A, B = rows.linearised(qpos[now], qvel[now], force[now], self.scale, free[now])
+        else:
+            q, v = rows.ahead(np.arange(now.sum()), qpos[now], qvel[now], force[now])
+            A, B = like.transition[now].copy(), like.driven[now].copy()
         n, after = len(q), np.flatnonzero(now) + 1
         with np.errstate(invalid="ignore", over="ignore"):
             drift = np.concatenate(

@@ -21,7 +21,7 @@ FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column sta
 PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
 STATES = 300  # of the motion, at which forces are compared
-LIKELY = 30  # candidates that are simulated, of those of which a first look tells something
+LIKELY = 20  # candidates that are simulated, of those of which a first look tells something
 PROMISING = 3  # groups of starts that are simulated
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
 

@@ -124,7 +124,7 @@ class Identification:
         smoother, trajectory, ahead = copy(self.smoother), self.trajectory, copy(judge.ahead)
         again = Judge(ahead, self.usual, judge.reference, self.seen)
         for k in range(ANEW):
-            trajectory = smoother.locate(fitted.setting, trajectory, passes=1)
+            trajectory = smoother.locate(fitted.setting, trajectory, passes=1, near=k > 0)
             ahead.start(trajectory)
             before, fitted = fitted, again.fit(fitted.setting, steps=2)
             if k and fitted.loss > before.loss - SETTLED:

@@ -63,7 +63,8 @@ def _alike(judge, chain, fitted, candidate, pool):
     explain.
     """
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    columns = Columns(chain, rest, judge.usual, _near(chain.world, candidate, pool) + list(rest))
+    near = _near(chain.world, candidate, pool) + list(rest)
+    columns = Columns(chain, rest, judge.usual, near, few=True)
     gone = columns.residual - chain.residual([fitted.setting])[0]
     evidence = Evidence(chain, gone, columns.array, fitted.evidence.floor)
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]

@@ -1,7 +1,7 @@
 """One recorded row ahead, from any state at its beginning, for all rows of recordings in one call.
 
 rows = RowMap(world, recordings, {friction: (0.1,)})
-qpos, qvel = rows.ahead(rows.begin, qpos, qvel, force)
+qpos, qvel = rows.ahead(np.arange(len(rows.begin)), qpos, qvel, force)
 """
 
 import mujoco
@@ -87,8 +87,8 @@ class RowMap:
         )
 
     def ahead(self, index, qpos, qvel, force):
-        """States after rows `index` (n,) of `begin` from states (n, nq), (n, nv) under force (n,
-        nv).
+        """States after rows begin[index], index (n,), from states (n, nq), (n, nv) under force
+        (n, nv).
 
         Returns qpos (n, nq), qvel (n, nv).
         """

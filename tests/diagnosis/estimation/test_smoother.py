@@ -1,8 +1,11 @@
 """The located force against hidden ones that were put into stock MuJoCo, and against none."""
 
+from copy import copy
+
 import mujoco
 import numpy as np
 import pytest
+from plants import DRIVEN_PENDULUM, recorded
 
 from diagnosis.estimation import windowing
 from diagnosis.estimation.smoother import Smoother
@@ -131,3 +134,18 @@ def test_under_the_right_correction_the_force_is_gone():
     after = smoother.locate({world.candidate("viscous_damping", "j"): (0.15,)}, before)
     rms = lambda t: np.sqrt(np.mean(t.force[5:-5] ** 2))
     assert rms(after) < 0.1 * rms(before)
+
+
+def test_transitions_taken_over_lead_to_the_same_motion():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded("0.csv", 0, damping=0.2)]
+    smoother, damping = Smoother(world, runs), world.candidate("viscous_damping", "pivot")
+    trajectory = smoother.locate({damping: (0.18,)})
+    found = {}
+    for near in (False, True):
+        other = copy(smoother)
+        found[near] = other.locate({damping: (0.2,)}, trajectory, passes=2, near=near)
+    scale = abs(found[False].force - trajectory.force).max()
+    assert scale > 1e-3
+    np.testing.assert_allclose(found[True].force, found[False].force, atol=0.05 * scale)
+    np.testing.assert_allclose(found[True].qpos, found[False].qpos, atol=1e-5)
