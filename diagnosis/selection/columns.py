@@ -21,7 +21,7 @@ FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column sta
 PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
 STATES = 300  # of the motion, at which forces are compared
-LIKELY = 20  # candidates that are simulated, of those of which a first look tells something
+LIKELY, LOCAL = 20, 4  # candidates with columns, for all dofs and for each, of a first look
 PROMISING = 3  # groups of starts that are simulated
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
 
@@ -150,10 +150,12 @@ class Columns:
 
     def _likely(self, starts):
         """The starts that are worth a column in full: of what is in the setting, of what a first
-        look tells nothing of, and of those that explain most in it."""
+        look tells nothing of, and of those that explain most in it, of all or of a dof."""
         told = first_look(self.ahead, self.setting, starts)
         told = {c: share for c, share in told.items() if c not in self.setting}
-        most = set(sorted(told, key=lambda c: -told[c])[:LIKELY])
+        most = set(sorted(told, key=lambda c: -told[c].mean())[:LIKELY])
+        for d in range(self.world.model.nv):
+            most |= set(sorted(told, key=lambda c: -told[c][d])[:LOCAL])
         return [start for start in starts if start[0] in most or start[0] not in told]
 
     def _promising(self, candidate, whole):

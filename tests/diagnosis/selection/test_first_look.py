@@ -37,10 +37,11 @@ def starts(world, *names):
 def test_what_is_missing_explains_most(scene):
     world, chain, _ = scene
     share = first_look(chain, {}, starts(world, "coulomb_friction", "armature", "mass"))
-    ranked = [c.effect.name for c in sorted(share, key=lambda c: -share[c])]
-    assert ranked[0] == "coulomb_friction" and max(share.values()) > 0.8
+    ranked = [c.effect.name for c in sorted(share, key=lambda c: -share[c][0])]
+    assert ranked[0] == "coulomb_friction" and max(s[0] for s in share.values()) > 0.8
     truth = {world.candidate("coulomb_friction", "pivot"): (0.1,)}
-    assert max(first_look(chain, truth, starts(world, "armature", "mass")).values()) < 0.3
+    left = first_look(chain, truth, starts(world, "armature", "mass"))
+    assert max(s[0] for s in left.values()) < 0.3
 
 
 def test_sensors_and_motions_that_mostly_touch_are_not_judged(scene):
@@ -56,6 +57,7 @@ def test_sensors_and_motions_that_mostly_touch_are_not_judged(scene):
 def test_few_columns_are_those_of_the_likely_and_of_what_no_row_tells(scene, monkeypatch):
     world, chain, usual = scene
     monkeypatch.setattr(columns, "LIKELY", 1)
+    monkeypatch.setattr(columns, "LOCAL", 1)
     names = "coulomb_friction", "armature", "mass", "sensor_scale"
     candidates = [c for c in world.candidates if c.effect.name in names]
     few = Columns(chain, {}, usual, candidates, few=True)
