@@ -37,7 +37,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "gross windows count": {"diagnosis.selection.criterion:GROSS": 1e9},
     "no floor of a cell's error": {"diagnosis.selection.criterion:SHARE": 0.0},
     "differences must be alike": {"diagnosis.selection.criterion:INDEPENDENT": 0.0},
-    "no first look": {"diagnosis.selection.columns:LIKELY": 10**6},
+    "no first look": {"diagnosis.selection.first_look:EACH": 10**6},
     "one horizon": {"diagnosis.estimation.ahead:HORIZONS": (1.0,)},
 }
 COLUMNS = (

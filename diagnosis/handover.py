@@ -84,30 +84,45 @@ class Check:
             model, self.windows, files.predicted(model, self.windows), self.noise
         )
 
-    def error(self, files):
-        """The contract's error of Files; infinite where they do not run."""
+    def smoothed(self):
+        """The windows, begun at the motion that is located under the nominal model: noise of start
+        states as recorded moves a prediction by more than many an effect does."""
+        path, begun = self.smoother.locate({}), {}
+        for r in self.recordings:
+            rows = path.rows(r)
+            begun[r] = replace(r, qpos=path.qpos[rows], qvel=path.qvel[rows])
+        return [w._replace(recording=begun[w.recording]) for w in self.windows]
+
+    def error(self, files, windows=None):
+        """The contract's error of Files, or that of windows begun otherwise; infinite where they do
+        not run."""
+        model = self.world.model
         try:
-            return self.errors(files)[0]
+            predicted = files.predicted(model, windows or self.windows)
         except (ScriptError, ValueError, mujoco.FatalError):
             return np.inf
+        return windowing.error(model, self.windows, predicted, self.noise)[0]
 
 
 def accepted(world, check, setting, refit=lambda setting: setting, log=lambda what: None):
-    """The Handed of what of a setting earns its place on kept-back recordings: together better than
-    the nominal
-    model, and each finding better with than without. refit(setting): what is left, fitted again."""
+    """The Handed of what of a setting earns its place on kept-back recordings, from smoothed start
+    states: together better than the nominal model, and each finding better with than without.
+    refit(setting): what is left, fitted again."""
     nominal = Files.of(world, {})
-    before = check.error(nominal)
+    windows = check.smoothed()
+    before = check.error(nominal, windows)
     while True:
         files = Files.of(world, setting)
-        after = check.error(files)
-        without = {
-            out: check.error(Files.of(world, {c: v for c, v in setting.items() if c is not out}))
+        after = check.error(files, windows)
+        less = {
+            out: Files.of(world, {c: v for c, v in setting.items() if c is not out})
             for out in setting
         }
+        without = {out: check.error(rest, windows) for out, rest in less.items()}
         held = [c for c in setting if files.forms[c] in ("mjcf", "python")]
         worst = min(held, key=lambda c: without[c], default=None)
         if worst is None or without[worst] > after and after < before:
-            return Handed(setting, files, nominal, without)
+            told = {out: check.error(rest) for out, rest in less.items()}
+            return Handed(setting, files, nominal, told)
         log(f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with")
         setting = refit({c: v for c, v in setting.items() if c is not worst})

@@ -5,6 +5,7 @@ start, nodes = Beam(columns, evidence).nodes()
 
 from dataclasses import dataclass
 
+from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection.criterion import PRICE, Score, complexity
 from diagnosis.selection.judge import moved_setting, problem
 
@@ -66,7 +67,7 @@ class Beam:
                     if key in met:
                         continue
                     met[key] = new = self.node(options)
-                    if new.unpriced < node.unpriced - LEAST:
+                    if new.unpriced < node.unpriced - LEAST and not self._unnamed(k):
                         grown.append(new)
             if not grown:
                 break
@@ -74,6 +75,11 @@ class Beam:
             for node in beam:
                 self._reduced(node, met)
         return start, sorted(met.values(), key=lambda n: n.loss)
+
+    def _unnamed(self, k):
+        """Whether an option is a curve: it leaves so little that what stands beside it would fill
+        the beam. The next round looks for that."""
+        return isinstance(self.columns.options[k].candidate.effect, Unknown)
 
     def _different(self, nodes):
         """The best node of each set of candidates, best first."""

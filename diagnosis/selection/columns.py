@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.estimation import windowing
-from diagnosis.selection.first_look import first_look
+from diagnosis.selection.first_look import likely
 from diagnosis.selection.plausibility import plausible
 
 TOGETHER = 40  # settings that are simulated in one call
@@ -21,7 +21,6 @@ FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column sta
 PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
 STATES = 300  # of the motion, at which forces are compared
-LIKELY, LOCAL = 20, 4  # candidates with columns, for all dofs and for each, of a first look
 PROMISING = 3  # groups of starts that are simulated
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
 
@@ -100,8 +99,10 @@ class Columns:
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts = []
         starts = [start for candidate in candidates for start in self._starts(candidate)]
-        starts += [self._whole(candidate, values) for candidate, values in curves]
-        self._simulate(self._likely(starts) if few else starts)
+        if few:
+            kept = likely(ahead, setting, starts)
+            starts = [start for start in starts if start[0] in kept]
+        self._simulate(starts + [self._whole(candidate, values) for candidate, values in curves])
 
     @property
     def array(self):
@@ -147,16 +148,6 @@ class Columns:
         prior = plausible(candidate, self.usual)
         low, high = np.array([FULL]).T
         return candidate, np.zeros(len(values)), np.array([values]), low, high, prior, False
-
-    def _likely(self, starts):
-        """The starts that are worth a column in full: of what is in the setting, of what a first
-        look tells nothing of, and of those that explain most in it, of all or of a dof."""
-        told = first_look(self.ahead, self.setting, starts)
-        told = {c: share for c, share in told.items() if c not in self.setting}
-        most = set(sorted(told, key=lambda c: -told[c].mean())[:LIKELY])
-        for d in range(self.world.model.nv):
-            most |= set(sorted(told, key=lambda c: -told[c][d])[:LOCAL])
-        return [start for start in starts if start[0] in most or start[0] not in told]
 
     def _promising(self, candidate, whole):
         """Of starts that come in groups, those of the groups whose force is most like the located

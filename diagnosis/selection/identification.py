@@ -112,10 +112,12 @@ class Identification:
 
     def _curves(self, setting):
         """[(candidate, values)] of forces without a name, in joints that no effect of a setting
-        acts at: beside one, every curve is significant, and its size decides in the end."""
+        acts at: beside one, every curve is significant, and its size decides in the end. What
+        depends on the joint's own speed alone is friction of some kind: names are tried first."""
         found = dependences(self.world, self.trajectory, self.train)
         joints = [self.world.joints(c.place) or () for c in setting]
         taken = {self.world.model.joint(j).name for some in joints for j in some}
+        found = [d for d in found if d.variables != (f"velocity:{d.joint}",)]
         return [(d.candidate, d.values) for d in found if d.joint not in taken]
 
     def _begun_anew(self, judge, fitted):
