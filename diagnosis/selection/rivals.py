@@ -20,19 +20,18 @@ REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
 def classes(candidates, judge, chain, fitted, log=lambda what: None):
-    """(Fitted, {candidate: [(other, values)]}): each finding by the simplest member of its class,
-    and the other members."""
+    """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
+    its price, and the other members."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting:
             continue
         members = _members(candidates, judge, chain, fitted, candidate)
-        simpler = [f for f, _ in members if complexity(f.setting) < complexity(fitted.setting)]
-        simplest = min([fitted, *simpler], key=lambda f: f.loss)
-        if simplest is not fitted:
-            log(f"  simpler in its class: {candidate} -> {list(simplest.setting)[-1]}")
+        best = min([fitted, *(f for f, _ in members)], key=lambda f: f.loss)
+        if best is not fitted:
+            log(f"  better in its class: {candidate} -> {list(best.setting)[-1]}")
             previous = fitted.setting[candidate]
-            fitted, swapped = simplest, True
+            fitted, swapped = best, True
             own = list(fitted.setting)[-1]
             others[own] = [(candidate, previous)]
             others[own] += [(o, f.setting[o]) for f, o in members if o is not own]
@@ -43,14 +42,16 @@ def classes(candidates, judge, chain, fitted, log=lambda what: None):
 
 
 def _members(candidates, judge, chain, fitted, candidate):
-    """[(Fitted, other)] of the effects that predict as well in a finding's place, best first."""
+    """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
+    their price, best first."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting and c.effect.name != "time_step"]
     near = _alike(judge, chain, fitted, candidate, pool)
     out = []
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
-        if tried.settled and tried.score.loss < fitted.score.loss + TIED:
+        tied = tried.score.loss < fitted.score.loss + TIED
+        if tried.settled and (tied or tried.loss < fitted.loss):
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 

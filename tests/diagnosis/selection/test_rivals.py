@@ -1,0 +1,61 @@
+"""Classes: what takes a finding's place, what is told beside it, and what is neither."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from diagnosis.selection import rivals
+from diagnosis.selection.criterion import PRICE
+
+
+class Named:
+    """As much of a Candidate as the choice looks at."""
+
+    def __init__(self, name, units):
+        self.name = name
+        self.effect = SimpleNamespace(simplicity=units - 1, name=name)
+        self.parameters = (None,)
+
+
+DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)
+
+
+def chosen(monkeypatch, fitted, losses):
+    """(setting's names, {name: names of others}) after classes; losses: {name: unpriced loss} of
+    sets of one effect."""
+    names = {c.name: c for c in (DRY, CURVED)}
+
+    class Judge:
+        def fit(self, setting, steps=0):
+            (c,) = setting
+            units = c.effect.simplicity + 1
+            loss = losses[c.name]
+            score = SimpleNamespace(loss=loss)
+            each = {"setting": setting, "score": score, "loss": loss + PRICE * units}
+            return SimpleNamespace(**each, settled=True)
+
+    others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
+    monkeypatch.setattr(rivals, "_alike", lambda *args: others)
+    start = Judge().fit({names[fitted]: (2.0,)})
+    found, told = rivals.classes([DRY, CURVED], Judge(), None, start)
+    return [c.name for c in found.setting], {
+        c.name: [o.name for o, _ in each] for c, each in told.items()
+    }
+
+
+@pytest.mark.parametrize(
+    "fitted, losses, name, others",
+    [
+        # three units more, at 0.1 nats each, for less than that
+        ("stribeck", {"stribeck": 0.0, "coulomb": 0.2}, "coulomb", ["stribeck"]),
+        ("stribeck", {"stribeck": 0.0, "coulomb": 0.4}, "stribeck", []),
+        ("coulomb", {"stribeck": 0.0, "coulomb": 0.4}, "stribeck", ["coulomb"]),
+        ("coulomb", {"stribeck": 0.05, "coulomb": 0.0}, "coulomb", ["stribeck"]),
+        ("coulomb", {"stribeck": 0.2, "coulomb": 0.0}, "coulomb", []),
+    ],
+)
+def test_the_best_for_its_price_stands_and_what_predicts_as_well_is_told(
+    monkeypatch, fitted, losses, name, others
+):
+    found, told = chosen(monkeypatch, fitted, losses)
+    assert found == [name] and told[name] == others
