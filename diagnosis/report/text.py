@@ -344,14 +344,23 @@ def doubts(finding: dict) -> list[str]:
     """What speaks against the name of a finding, a few words each."""
     found = []
     if finding.get("adequate") is False:
-        on = depends_words(finding.get("rest_depends_on")) or "something"
-        found.append(f"the nearest name only: the rest of its force depends on {on} still")
+        found.append(f"the nearest name only: {nearest_only(finding)}")
     if finding.get("strains"):
         found.append(f"hard to believe: {finding['strains']}")
     constancy = finding.get("constancy")
     if constancy is not None and constancy < UNSTEADY:
         found.append(f"the recordings do not agree on one value: p {p_value(constancy)}")
     return found
+
+
+def nearest_only(finding: dict) -> str:
+    """Why a finding is not adequate."""
+    if on := depends_words(finding.get("rest_depends_on")):
+        return f"the rest of its force depends on {on} still"
+    seen = [p for p in finding["parameters"] if p.get("low") is not None]
+    if all(p["low"] <= (p["nominal"] or 0.0) <= p["high"] for p in seen):
+        return "its intervals hold the nominal values"
+    return "much of the error is left"
 
 
 def sentence(words: str) -> str:
