@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 from synthetic import clustered, evidence_of, scene
 
+from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Option
 from diagnosis.selection.plausibility import Prior
@@ -40,3 +41,24 @@ def test_two_that_explain_all_are_met_beside_many_that_each_lower_squares_more()
     assert max(gains[:2]) < min(gains[2:])  # a look at squares leaves them out
     met = [{options[k].candidate.name for k in node.options} for node in nodes]
     assert met[0] == {"strong", "weak"}
+
+
+def test_a_curve_is_met_alone_and_not_beside_others():
+    rng, ahead = np.random.default_rng(1), scene()
+    first, second = (clustered(rng, ahead, share=0.0) for _ in range(2))
+    curve, name = Named("curve"), Named("name")
+    curve.effect = Unknown("time", (0.0, 1.0))
+    columns = np.stack([first, second], -1)
+    vague = Prior(np.zeros(1), np.full(1, np.inf), np.full(1, -9.0), np.full(1, 9.0))
+    bounds = np.full(1, -9.0), np.full(1, 9.0)
+    options = [
+        Option(c, np.zeros(1), np.ones((1, 1)), (k,), *bounds, vague)
+        for k, c in enumerate((curve, name))
+    ]
+    noise = 0.1 * clustered(rng, ahead, share=0.0)
+    beam = Beam(
+        SimpleNamespace(options=options, setting={}),
+        evidence_of(ahead, 5 * first + 0.01 * second + noise, columns),
+    )
+    met = {frozenset(options[k].candidate.name for k in n.options) for n in beam.nodes()[1]}
+    assert met == {frozenset(), frozenset({"curve"}), frozenset({"name"})}

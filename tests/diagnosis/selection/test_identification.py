@@ -1,0 +1,67 @@
+"""The rules of a round: which curves compete, and which set is chosen."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from arm import ARM
+
+from diagnosis.selection import identification
+from diagnosis.selection.criterion import PRICE, Score
+from diagnosis.selection.identification import Identification
+from diagnosis.selection.unmodelled_force import Dependence
+from diagnosis.simulation.simulator import World
+
+
+@pytest.fixture
+def search():
+    world = World(mujoco.MjSpec.from_string(ARM))
+    found = Identification(world, [])
+    found.trajectory = None
+    return found
+
+
+def curves_of(search, monkeypatch, setting):
+    """Variables of the curves that compete beside a setting, of four that were located."""
+    four = [
+        ("elbow", ("velocity:elbow",)),
+        ("elbow", ("position:shoulder",)),
+        ("elbow", ("time", "velocity:elbow")),
+        ("shoulder", ("position:shoulder",)),
+    ]
+    located = [Dependence(joint, told, 0.9, 1.0, (joint, told), ()) for joint, told in four]
+    monkeypatch.setattr(identification, "dependences", lambda *args: located)
+    return [candidate for candidate, _ in search._curves(setting)]
+
+
+def test_curves_compete_but_for_those_over_the_joints_own_speed(search, monkeypatch):
+    told = [variables for _, variables in curves_of(search, monkeypatch, {})]
+    assert told == [("position:shoulder",), ("time", "velocity:elbow"), ("position:shoulder",)]
+
+
+def test_beside_a_name_no_curve_of_its_joint_competes(search, monkeypatch):
+    friction = search.world.candidate("coulomb_friction", "elbow")
+    left = curves_of(search, monkeypatch, {friction: (0.1,)})
+    assert [joint for joint, _ in left] == ["shoulder"]
+
+
+def fitted(search, names, loss, settled=True):
+    """A Fitted of effects in the elbow with a loss that every group shares but for a little."""
+    groups = loss + 1e-3 * np.arange(16)
+    setting = {search.world.candidate(name, "elbow"): () for name in names}
+    score = Score(groups.mean(), groups, (), 3)
+    whole = score.loss + PRICE * identification.complexity(setting)
+    return SimpleNamespace(setting=setting, score=score, loss=whole, settled=settled)
+
+
+def test_a_set_is_chosen_for_its_worth(search):
+    now = fitted(search, [], 0.0)
+    friction = fitted(search, ["coulomb_friction"], -1.0)
+    both = fitted(search, ["coulomb_friction", "viscous_damping"], -1.05)
+    better = fitted(search, ["coulomb_friction", "viscous_damping"], -1.5)
+    bound = fitted(search, ["armature"], -3.0, settled=False)
+    little = fitted(search, ["coulomb_friction"], -0.05)
+    assert search._choose([now, friction, both, bound], now, 10) is friction
+    assert search._choose([now, friction, better], now, 10) is better
+    assert search._choose([now, little], now, 10) is now  # not worth its price
