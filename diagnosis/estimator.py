@@ -16,7 +16,7 @@ from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
-from diagnosis.selection.criterion import PRICE, freedom, paired
+from diagnosis.selection.criterion import PRICE, complexity, freedom, paired
 from diagnosis.selection.identification import LEVEL, Found, Identification
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
@@ -97,13 +97,13 @@ def _checked(search, found, fitted, others, log):
     left = unmodelled_force.dependences(world, trajectory, train)
     for rest in left[:2]:
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=2)
-        # where no name is left, a force without one need not pay for being no name
-        gain = paired(fitted.score, beside.score)
-        price = PRICE * freedom(rest.candidate)
-        if gain.gain < price or gain.p_value > LEVEL / len(search.candidates):
+        mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
+        # where no name is found, a force without one need not pay for being no name
+        units = complexity([rest.candidate]) if mine else freedom(rest.candidate)
+        step = paired(fitted.score, beside.score)
+        if step.gain < PRICE * units or step.p_value > LEVEL / 2 / len(search.candidates):
             continue
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
-        mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         size = _force(found, trajectory, world, rest.joint)
         if not mine or rest.size > INSTEAD * size:
             fitted = search.pruned(judge, beside) if mine else beside
@@ -153,7 +153,7 @@ def _hand_over(world, held, kept_back, outcome, log):
         decides = Check(world, kept_back, Smoother(world, kept_back), noise)
     judge = outcome.found.judge
     refit = lambda some: judge.fit(some, steps=3).setting
-    outcome.handed = accepted(world, decides, setting, refit, log)
+    outcome.handed = accepted(world, decides, setting, refit, log, told=check)
     kept = outcome.handed.setting
     if len(kept) < len(setting):
         outcome.fitted = judge.fit(kept, steps=0)

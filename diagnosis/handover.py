@@ -6,6 +6,7 @@ handed.files.xml, handed.setting
 """
 
 import tempfile
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -77,37 +78,34 @@ class Check:
         """Smooth the recordings under a setting, for the floor."""
         self.trajectory = self.smoother.locate(setting, passes=2)
 
-    def errors(self, files):
-        """(error of Files over all channels in noises, {channel: SI})."""
+    def errors(self, files, windows=None):
+        """(error of Files over all channels in noises, {channel: SI}), or that of windows begun
+        otherwise."""
         model = self.world.model
-        return windowing.error(
-            model, self.windows, files.predicted(model, self.windows), self.noise
-        )
+        predicted = files.predicted(model, windows or self.windows)
+        return windowing.error(model, self.windows, predicted, self.noise)
 
     def smoothed(self):
         """The windows, begun at the motion that is located under the nominal model: noise of start
         states as recorded moves a prediction by more than many an effect does."""
-        path, begun = self.smoother.locate({}), {}
+        path, begun = copy(self.smoother).locate({}), {}
         for r in self.recordings:
             rows = path.rows(r)
             begun[r] = replace(r, qpos=path.qpos[rows], qvel=path.qvel[rows])
         return [w._replace(recording=begun[w.recording]) for w in self.windows]
 
     def error(self, files, windows=None):
-        """The contract's error of Files, or that of windows begun otherwise; infinite where they do
-        not run."""
-        model = self.world.model
+        """As errors(), of all channels; infinite where they do not run."""
         try:
-            predicted = files.predicted(model, windows or self.windows)
+            return self.errors(files, windows)[0]
         except (ScriptError, ValueError, mujoco.FatalError):
             return np.inf
-        return windowing.error(model, self.windows, predicted, self.noise)[0]
 
 
-def accepted(world, check, setting, refit=lambda setting: setting, log=lambda what: None):
+def accepted(world, check, setting, refit=lambda some: some, log=lambda what: None, told=None):
     """The Handed of what of a setting earns its place on kept-back recordings, from smoothed start
     states: together better than the nominal model, and each finding better with than without.
-    refit(setting): what is left, fitted again."""
+    refit(setting): what is left, fitted again; told: the Check of the errors that are told."""
     nominal = Files.of(world, {})
     windows = check.smoothed()
     before = check.error(nominal, windows)
@@ -122,7 +120,7 @@ def accepted(world, check, setting, refit=lambda setting: setting, log=lambda wh
         held = [c for c in setting if files.forms[c] in ("mjcf", "python")]
         worst = min(held, key=lambda c: without[c], default=None)
         if worst is None or without[worst] > after and after < before:
-            told = {out: check.error(rest) for out, rest in less.items()}
-            return Handed(setting, files, nominal, told)
+            errors = {out: (told or check).error(rest) for out, rest in less.items()}
+            return Handed(setting, files, nominal, errors)
         log(f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with")
         setting = refit({c: v for c, v in setting.items() if c is not worst})

@@ -89,7 +89,7 @@ class Chain(Ahead):
 
     def missing(self, setting, rows):
         """(rows, 2 nv): the smoothed motion less the predicted one, a row on, of rows (n,)."""
-        t = self.trajectory
+        t, setting = self.trajectory, {c: v for c, v in setting.items() if not self.apart(c)}
         self.map = RowMap(self.world, list(t.first), setting, like=self.map)
         index, none = np.searchsorted(self.map.begin, rows), np.zeros((len(rows), self.model.nv))
         qpos, qvel = self.map.ahead(index, t.qpos[rows], t.qvel[rows], none)

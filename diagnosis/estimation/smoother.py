@@ -199,6 +199,7 @@ class Smoother:
                 [windowing.difference(model, qpos[after], q), v - qvel[after]], axis=1
             ) - np.einsum("nij,nj->ni", B, force[now])
         bad = free[now] | ~np.isfinite(drift).all(1) | ~np.isfinite(A).all((1, 2))
+        bad |= ~B.any((1, 2))  # where another one glides
         seconds = rows.seconds[bad]
         A[bad], B[bad] = np.eye(2 * nv), 0.0
         A[bad, :nv, nv:] = np.eye(nv) * seconds[:, None, None]

@@ -343,7 +343,7 @@ def terminal(summary: dict, out: str, files: list[str]) -> str:
 def doubts(finding: dict) -> list[str]:
     """What speaks against the name of a finding, a few words each."""
     found = []
-    if finding.get("adequate") is False:
+    if finding.get("adequate") is False and finding["effect"] != "unknown":
         found.append(f"the nearest name only: {nearest_only(finding)}")
     if finding.get("strains"):
         found.append(f"hard to believe: {finding['strains']}")
@@ -358,6 +358,8 @@ def nearest_only(finding: dict) -> str:
     if on := depends_words(finding.get("rest_depends_on")):
         return f"the rest of its force depends on {on} still"
     seen = [p for p in finding["parameters"] if p.get("low") is not None]
+    if not seen:
+        return "none of its values shows"
     if all(p["low"] <= (p["nominal"] or 0.0) <= p["high"] for p in seen):
         return "its intervals hold the nominal values"
     return "much of the error is left"

@@ -116,7 +116,7 @@ class Beam:
         for k in sorted(each, key=lambda k: -each[k]):
             candidate = self.columns.options[k].candidate
             seen[candidate] = seen.get(candidate, 0) + 1
-            if seen[candidate] <= 2:  # starts of one candidate
+            if seen[candidate] <= 2 and not self._unnamed(k):  # starts of one candidate
                 best.append(k)
         return best[:LOOKS]
 

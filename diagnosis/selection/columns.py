@@ -146,7 +146,7 @@ class Columns:
     def _whole(self, candidate, values):
         """The start of a curve at the forces that were located."""
         prior = plausible(candidate, self.usual)
-        low, high = np.array([FULL]).T
+        low, high = (np.array([amount]) for amount in FULL)
         return candidate, np.zeros(len(values)), np.array([values]), low, high, prior, False
 
     def _promising(self, candidate, whole):

@@ -19,8 +19,9 @@ def likely(chain, setting, starts):
     """Of the candidates of starts [(candidate, base, directions, ...)], those that explain most
     alone, or beside the best: friction shows in a model with a wrong damping only beside that.
 
-    Kept is also what no row tells of: effects with states of their own or of the sensors, and those
-    that change nothing in these rows; and everything, of a motion that mostly touches something.
+    Kept is also what no row tells of: effects with states of their own or of the sensors, those
+    that change nothing in these rows or end in nothing finite; and everything, of a motion that
+    mostly touches something.
     """
     every = {start[0] for start in starts}
     free = chain.begin[~chain.trajectory.free[chain.begin]]
@@ -44,18 +45,21 @@ def likely(chain, setting, starts):
 def _bases(chain, setting, starts, rows):
     """(target (n,), [(candidate, basis (n, k))]): what is missing in some rows of all dofs, and how
     starts change it."""
-    nv, bases = chain.model.nv, []
-    gap = chain.missing(setting, rows)[:, nv:]
+    dofs, bases = chain.model.nv + np.flatnonzero(np.isfinite(chain.noise)), []
+    gap = chain.missing(setting, rows)[:, dofs]
+    usable = np.isfinite(gap).all(1)
+    rows, gap = rows[usable], gap[usable]
     size = 1.4826 * np.median(abs(gap), 0) + LEAST * np.sqrt(np.mean(gap**2, 0)) + 1e-12
+    weight = 1 / np.maximum(size, abs(gap) / ODD)
     for candidate, base, directions, *_ in starts:
         if candidate in setting or chain.apart(candidate):
             continue
         settings = [{**setting, candidate: tuple(base + row)} for row in directions]
-        moved = [((gap - chain.missing(s, rows)[:, nv:]) / size).ravel() for s in settings]
+        moved = [((gap - chain.missing(s, rows)[:, dofs]) * weight).ravel() for s in settings]
         basis = [m / abs(m).max() for m in moved if m.any()]
-        if basis:
+        if basis and np.isfinite(basis).all():
             bases.append((candidate, np.stack(basis, 1)))
-    return np.clip(gap / size, -ODD, ODD).ravel(), bases
+    return (gap * weight).ravel(), bases
 
 
 def explained(basis, target):

@@ -7,6 +7,7 @@ found.fitted.setting; found.trajectory
 from copy import copy
 from dataclasses import dataclass
 
+from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
@@ -20,8 +21,9 @@ from diagnosis.selection.unmodelled_force import dependences
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
 IDLE = 1.0  # nats that an effect must promise beside those chosen, to be looked at once more
-SETTLED = 0.025  # loss that other start states still remove, from which on they stay
+STAYS = 0.025  # loss that other start states still remove, from which on they stay
 ANEW = 4  # times that a set is fitted to start states of its own, at most
+CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
 
 
@@ -101,7 +103,7 @@ class Identification:
             fitted, by = self._begun_anew(judge, judge.fit(beam.setting(node), steps=3))
             self.log(f"  linear {node.loss:.3f} judged {fitted.loss:.3f} {said(fitted.setting)}")
             judged[fitted] = by
-        number = len({o.candidate for o in columns.options})
+        number = len(every) + len(curves)
         best = self._choose(list(judged), now, number)
         if best is not now:
             judge = judged[best]
@@ -111,14 +113,14 @@ class Identification:
         return best, best is not now, [] if setting else self._ranking(beam, start, nodes)
 
     def _curves(self, setting):
-        """[(candidate, values)] of forces without a name, in joints that no effect of a setting
-        acts at: beside one, every curve is significant, and its size decides in the end. What
+        """[(candidate, values)] of forces without a name, in joints that no effect of a setting has
+        for its place: beside one, every curve is significant, and its size decides in the end. What
         depends on the joint's own speed alone is friction of some kind: names are tried first."""
-        found = dependences(self.world, self.trajectory, self.train)
+        found = dependences(self.world, self.trajectory, self.train, most=None)
         joints = [self.world.joints(c.place) or () for c in setting]
         taken = {self.world.model.joint(j).name for some in joints for j in some}
         found = [d for d in found if d.variables != (f"velocity:{d.joint}",)]
-        return [(d.candidate, d.values) for d in found if d.joint not in taken]
+        return [(d.candidate, d.values) for d in found if d.joint not in taken][:CURVES]
 
     def _begun_anew(self, judge, fitted):
         """(Fitted again, its Judge) from the start states that the recordings have under a set: of
@@ -129,7 +131,7 @@ class Identification:
             trajectory = smoother.locate(fitted.setting, trajectory, passes=1, near=k > 0)
             ahead.start(trajectory)
             before, fitted = fitted, again.fit(fitted.setting, steps=2)
-            if k and fitted.loss > before.loss - SETTLED:
+            if k and fitted.loss > before.loss - STAYS:
                 break
         return fitted, again
 
@@ -137,7 +139,7 @@ class Identification:
         """Leave out of further rounds what would have added nothing beside the chosen effects."""
         last = {o.candidate: k for k, o in enumerate(columns.options)}
         node = beam.node([last[c] for c in chosen.setting if c in last])
-        most = dict.fromkeys(self.candidates, 0.0)
+        most = {}  # of what was looked at beside them
         for option, gain in zip(columns.options, beam.gains(node)):
             most[option.candidate] = max(most.get(option.candidate, 0.0), gain)
         self.idle |= {c for c, gain in most.items() if c not in chosen.setting and gain < IDLE}
@@ -150,27 +152,30 @@ class Identification:
             if node.loss >= start.loss or len(chosen) == FINALISTS:
                 break
             options = beam.columns.options
-            names = {options[k].candidate for k in node.options[len(start.options) :]}
+            added = [options[k].candidate for k in node.options[len(start.options) :]]
+            # curves of one joint are one explanation of its force
+            names = {c.place if isinstance(c.effect, Unknown) else c for c in added}
             if not any(names >= better for better in seen):
                 seen.append(names)
                 chosen.append(node)
         return chosen
 
     def _choose(self, judged, now, number):
-        """The simplest set over which the best is not earned, if that is over what there was."""
+        """The simplest set that is earned over what there was, and the best is not over it."""
         judged = [f for f in judged if f is now or f.settled]
         best = min(judged, key=lambda f: f.loss)
         if best is now or not self.earned(now, best, number):
             return now
 
-        good = [f for f in judged if f is best or (f is not now and not self.earned(f, best))]
+        good = [f for f in judged if f is not now and self.earned(now, f, number)]
+        good = [f for f in good if f is best or not self.earned(f, best)]
         return min(good, key=lambda f: (complexity(f.setting), f.loss))
 
     def earned(self, before, after, number=1):
-        """Whether a set is worth its complexity, and better by more than groups scatter, for the
-        number looked at."""
+        """Whether a set is worth its complexity, and better by no chance, for the number looked at
+        with two tests each."""
         step = paired(before.score, after.score)
-        return after.loss < before.loss and step.p_value < LEVEL / number
+        return after.loss < before.loss and step.p_value < LEVEL / number / 2
 
     def pruned(self, judge, fitted):
         """Without the effects that do not earn their place beside the others."""

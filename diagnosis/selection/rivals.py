@@ -1,5 +1,5 @@
 """What could stand in a finding's place: effects whose refits predict as well, told as a class, the
-simplest first.
+best for its price first.
 
 fitted, others = classes(candidates, judge, chain, fitted)
 others[candidate]                                    # [(other, values), ...]
@@ -27,16 +27,13 @@ def classes(candidates, judge, chain, fitted, log=lambda what: None):
         if candidate not in fitted.setting:
             continue
         members = _members(candidates, judge, chain, fitted, candidate)
-        best = min([fitted, *(f for f, _ in members)], key=lambda f: f.loss)
-        if best is not fitted:
-            log(f"  better in its class: {candidate} -> {list(best.setting)[-1]}")
-            previous = fitted.setting[candidate]
-            fitted, swapped = best, True
-            own = list(fitted.setting)[-1]
-            others[own] = [(candidate, previous)]
-            others[own] += [(o, f.setting[o]) for f, o in members if o is not own]
-        else:
-            others[candidate] = [(o, f.setting[o]) for f, o in members]
+        members.append((fitted, candidate))
+        fitted, own = min(members, key=lambda member: member[0].loss)
+        if own is not candidate:
+            log(f"  better in its class: {candidate} -> {own}")
+            swapped = True
+        tied = [(f, o) for f, o in members if f.score.loss < fitted.score.loss + TIED]
+        others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
     others = {c: each[:MOST] for c, each in others.items() if c in fitted.setting}
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 

@@ -48,7 +48,7 @@ class Curve:
 
 
 def dependences(world, trajectory, recordings, most=4):
-    """The Dependences of the located force of every hinge and slide, the largest force first."""
+    """The Dependences of the located force of every hinge and slide, the largest share first."""
     model, found = world.model, []
     ctrl = np.concatenate([r.ctrl for r in recordings])
     time = np.concatenate([r.time for r in recordings])

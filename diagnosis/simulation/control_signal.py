@@ -67,7 +67,7 @@ class Signal:
         return held - self.lag / step * np.diff(act)
 
     def _followed(self, start, step, count, average):
-        """As sample, of a limited rate with a lag: its mean over each step, exactly, then the lag
+        """As passed(), of a limited rate with a lag: its mean over each step, exactly, then the lag
         of these."""
         # until what was before does not count any more
         lead = max(0, int(np.ceil(min(start - self.delay - self.time[0], 40 * self.lag) / step)))

@@ -31,7 +31,7 @@ def curves_of(search, monkeypatch, setting):
         ("shoulder", ("position:shoulder",)),
     ]
     located = [Dependence(joint, told, 0.9, 1.0, (joint, told), ()) for joint, told in four]
-    monkeypatch.setattr(identification, "dependences", lambda *args: located)
+    monkeypatch.setattr(identification, "dependences", lambda *args, most: located)
     return [candidate for candidate, _ in search._curves(setting)]
 
 
