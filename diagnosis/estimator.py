@@ -16,7 +16,7 @@ from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
-from diagnosis.selection.criterion import PRICE, complexity, freedom, paired
+from diagnosis.selection.criterion import PRICE, complexity, paired
 from diagnosis.selection.identification import LEVEL, Found, Identification
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
@@ -24,6 +24,7 @@ from diagnosis.selection.plausibility import plausible
 # of a name's force, the size of a curve beside it from which on the name is only the nearest, and
 # from which on the curve takes its place
 NEAREST, INSTEAD = 0.25, 0.5
+UNNAMED = 2  # units of complexity of a force where nothing has a name
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 
 
@@ -98,8 +99,8 @@ def _checked(search, found, fitted, others, log):
     for rest in left[:2]:
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=2)
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
-        # where no name is found, a force without one need not pay for being no name
-        units = complexity([rest.candidate]) if mine else freedom(rest.candidate)
+        # where no name is found, all that is told are a joint and a variable
+        units = complexity([rest.candidate]) if mine else UNNAMED
         step = paired(fitted.score, beside.score)
         if step.gain < PRICE * units or step.p_value > LEVEL / 2 / len(search.candidates):
             continue

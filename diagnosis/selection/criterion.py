@@ -47,14 +47,9 @@ class Comparison:
     p_value: float
 
 
-def freedom(candidate):
-    """Units of complexity that an effect has for its parameters."""
-    return (1 + len(candidate.parameters)) / 2
-
-
 def complexity(candidates):
     """Of a set of effects: how far each is from the first things to think of, and its freedom."""
-    return sum(c.effect.simplicity + freedom(c) for c in candidates)
+    return sum(c.effect.simplicity + (1 + len(c.parameters)) / 2 for c in candidates)
 
 
 def paired(before, after):

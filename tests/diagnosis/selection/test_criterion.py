@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 from scipy.stats import ttest_rel
 from synthetic import clustered, evidence_of, free, scene
 
-from diagnosis.selection.criterion import Score, bounded, complexity, freedom, paired
+from diagnosis.selection.criterion import Score, bounded, complexity, paired
 from diagnosis.simulation.simulator import World
 
 
@@ -139,4 +139,4 @@ def test_what_is_farther_from_the_first_things_to_think_of_and_freer_is_more_com
     assert of("coulomb_friction", "viscous_damping") == 2
     assert of("gain") < of("armature") < of("dead_zone") < of("stribeck_friction")
     assert of("stribeck_friction") < complexity([curve])
-    assert freedom(curve) == 5
+    assert complexity([curve]) == 8
