@@ -103,7 +103,7 @@ def verdict(findings, something):
     """match, mismatch, or unresolved: something is missing and no name explains it well enough."""
     if not findings:
         return "unresolved" if something else "match"
-    named = findings[0]["effect"] != "unknown" and findings[0]["adequate"]
+    named = findings[0]["effect"] != "unknown" and any(f["adequate"] for f in findings)
     return "mismatch" if named else "unresolved"
 
 

@@ -21,14 +21,16 @@ REFITS, MOST = 4, 3  # others that are refitted, and told
 
 def classes(candidates, judge, chain, fitted, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
-    its price, and the other members."""
+    its price, and the other members. Among equals the finding stays."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting:
             continue
         members = _members(candidates, judge, chain, fitted, candidate)
+        units, most = complexity(fitted.setting), fitted.loss - TIED
+        better = [m for m in members if m[0].loss < most or complexity(m[0].setting) < units]
         members.append((fitted, candidate))
-        fitted, own = min(members, key=lambda member: member[0].loss)
+        fitted, own = min([(fitted, candidate), *better], key=lambda member: member[0].loss)
         if own is not candidate:
             log(f"  better in its class: {candidate} -> {own}")
             swapped = True

@@ -66,3 +66,13 @@ def test_a_finding_whose_intervals_hold_every_nominal_value_is_not_certain():
     assert findings.certain(friction, [(nominal + 0.1, nominal + 0.2)])
     assert not findings.certain(friction, [(nominal, nominal + 0.2)])
     assert not findings.certain(friction, [None])
+
+
+def test_a_mismatch_is_led_by_a_name_and_has_one_that_is_adequate():
+    name = lambda adequate: {"effect": "gain", "adequate": adequate}
+    unknown = {"effect": "unknown", "adequate": False}
+    assert findings.verdict([], something=False) == "match"
+    assert findings.verdict([], something=True) == "unresolved"
+    assert findings.verdict([name(False), name(True)], something=True) == "mismatch"
+    assert findings.verdict([name(False)], something=True) == "unresolved"
+    assert findings.verdict([unknown, name(True)], something=True) == "unresolved"

@@ -49,7 +49,8 @@ def chosen(monkeypatch, fitted, losses):
         # three units more, at 0.1 nats each, for less than that
         ("stribeck", {"stribeck": 0.0, "coulomb": 0.2}, "coulomb", ["stribeck"]),
         ("stribeck", {"stribeck": 0.0, "coulomb": 0.4}, "stribeck", []),
-        ("coulomb", {"stribeck": 0.0, "coulomb": 0.4}, "stribeck", []),
+        ("coulomb", {"stribeck": 0.0, "coulomb": 0.6}, "stribeck", []),
+        ("coulomb", {"stribeck": 0.0, "coulomb": 0.35}, "coulomb", ["stribeck"]),
         ("coulomb", {"stribeck": 0.05, "coulomb": 0.0}, "coulomb", ["stribeck"]),
         ("coulomb", {"stribeck": 0.2, "coulomb": 0.0}, "coulomb", []),
     ],
