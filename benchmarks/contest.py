@@ -36,10 +36,7 @@ from common import Recording  # noqa: E402
 from fields import fields  # noqa: E402
 
 from diagnosis.common.atomic_files import write_table, write_whole  # noqa: E402
-from diagnosis.estimation import (
-    prediction_error,  # noqa: E402
-    windowing,  # noqa: E402
-)
+from diagnosis.estimation import prediction_error, windowing  # noqa: E402
 from diagnosis.handover import Files  # noqa: E402
 from diagnosis.nominal.model import load_world  # noqa: E402
 from diagnosis.recordings import recording as recorded  # noqa: E402

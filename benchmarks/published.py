@@ -19,10 +19,7 @@ sys.path.insert(0, str(ROOT))
 
 from diagnosis.command import diagnose  # noqa: E402
 from diagnosis.common.atomic_files import write_table  # noqa: E402
-from diagnosis.estimation import (
-    prediction_error,  # noqa: E402
-    windowing,  # noqa: E402
-)
+from diagnosis.estimation import prediction_error, windowing  # noqa: E402
 
 CSV = ROOT / "results" / "published.csv"
 COLUMNS = ("rig", "model", "window", "channel", "nominal", "published", "diagnosed")

@@ -17,7 +17,7 @@ from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
 from diagnosis.selection.criterion import PRICE, complexity, paired
-from diagnosis.selection.identification import LEVEL, Found, Identification
+from diagnosis.selection.identification import Found, Identification, no_chance
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
 
@@ -102,7 +102,7 @@ def _checked(search, found, fitted, others, log):
         # where no name is found, all that is told are a joint and a variable
         units = complexity([rest.candidate]) if mine else UNNAMED
         step = paired(fitted.score, beside.score)
-        if step.gain < PRICE * units or step.p_value > LEVEL / 2 / len(search.candidates):
+        if step.gain < PRICE * units or not no_chance(step, len(search.candidates)):
             continue
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
         size = _force(found, trajectory, world, rest.joint)

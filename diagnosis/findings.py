@@ -13,7 +13,7 @@ from diagnosis.effects.base import JOINT_TRANSMISSIONS
 from diagnosis.estimation import prediction_error, windowing
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
-from diagnosis.selection import sensor_faults, transients
+from diagnosis.selection import sensor_faults
 
 SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing
 ENOUGH = 0.5  # of the error that findings remove, up to which what is left leaves them adequate
@@ -93,7 +93,7 @@ def _findings(world, outcome, bounds, figure):
     settings = outcome.fitted.setting
     found = [_finding(world, c, outcome, bounds, figure) for c in settings]
     if outcome.event:
-        found.append(transients.finding(outcome.event))
+        found.append(of_event(outcome.event))
     recordings = outcome.found.smoother.recordings
     found += sensor_faults.faults(world, settings, recordings, outcome.trajectory, outcome.event)
     return sorted(found, key=lambda f: -f["evidence"]["held_out_error_removed"])
@@ -138,6 +138,30 @@ def _finding(world, candidate, outcome, bounds, figure):
         ],
         **({"curve": form} if curve else {}),
         **({"rest_depends_on": list(rest)} if rest else {}),
+    }
+
+
+def of_event(event):
+    """The finding of an Event, as diagnosis.json has it."""
+    told = lambda candidate, *values: {
+        "effect": candidate.effect.name,
+        "place": place_of(candidate),
+        "parameters": parameters_of(candidate, *values),
+    }
+    bounds = [(a, b) if b > a else None for a, b in zip(event.low, event.high)]
+    return {
+        **told(event.candidate, event.values, bounds),
+        "evidence": {
+            "held_out_error_removed": 0.0,
+            "error_removed_there": event.removed,
+            "p_value": event.p_value,
+        },
+        "adequate": True,
+        "strains": None,
+        "depends_on": ["time"],
+        "when": event.when,
+        "written_as": "none",
+        "also_possible": [told(c, values) for c, values in event.others],
     }
 
 

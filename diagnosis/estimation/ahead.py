@@ -14,7 +14,6 @@ from diagnosis.estimation import windowing
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
 FEWEST = 16  # windows that there should be, if shorter ones make up for it
 MOST = 32  # windows that are simulated, evenly chosen of more
-SCREENED = 16  # of them, in which every candidate is looked at
 GROUPS = 16  # of neighbouring windows, the units that are left out and compared
 
 
@@ -69,11 +68,6 @@ class Ahead:
             3 * np.quantile(gone, 0.98, axis=0),
             10 * np.where(np.isfinite(self.noise), self.noise, 1.0),
         )
-
-    def sparse(self, most=SCREENED):
-        """An Ahead of some of the windows, for a first look."""
-        some = [self.windows[i] for i in windowing.evenly(len(self.windows), most)]
-        return Ahead(self.world, some, self.noise)
 
     def start(self, trajectory):
         """Begin the windows at a Trajectory's states."""

@@ -51,7 +51,7 @@ class Chain(Ahead):
         """Measured less predicted, (settings, W, T, nv), as of Ahead."""
         out = np.zeros((len(settings), *self.known.shape))
         if len(self.used):
-            plain = [{c: v for c, v in s.items() if not self.apart(c)} for s in settings]
+            plain = [self.plain(s) for s in settings]
             self._along(plain, out)
             self._beyond(settings, plain, out)
         if self.contacts:
@@ -87,9 +87,14 @@ class Chain(Ahead):
             return True
         return self.world.adds_states(candidate)
 
+    def plain(self, setting):
+        """What of a setting happens within a row."""
+        return {c: v for c, v in setting.items() if not self.apart(c)}
+
     def missing(self, setting, rows):
-        """(rows, 2 nv): the smoothed motion less the predicted one, a row on, of rows (n,)."""
-        t, setting = self.trajectory, {c: v for c, v in setting.items() if not self.apart(c)}
+        """(rows, 2 nv): the smoothed motion less the predicted one, a row on, of rows (n,), under
+        a plain setting."""
+        t = self.trajectory
         self.map = RowMap(self.world, list(t.first), setting, like=self.map)
         index, none = np.searchsorted(self.map.begin, rows), np.zeros((len(rows), self.model.nv))
         qpos, qvel = self.map.ahead(index, t.qpos[rows], t.qvel[rows], none)

@@ -46,7 +46,8 @@ def _bases(chain, setting, starts, rows):
     """(target (n,), [(candidate, basis (n, k))]): what is missing in some rows of all dofs, and how
     starts change it."""
     dofs, bases = chain.model.nv + np.flatnonzero(np.isfinite(chain.noise)), []
-    gap = chain.missing(setting, rows)[:, dofs]
+    plain = chain.plain(setting)
+    gap = chain.missing(plain, rows)[:, dofs]
     usable = np.isfinite(gap).all(1)
     rows, gap = rows[usable], gap[usable]
     size = 1.4826 * np.median(abs(gap), 0) + LEAST * np.sqrt(np.mean(gap**2, 0)) + 1e-12
@@ -54,7 +55,7 @@ def _bases(chain, setting, starts, rows):
     for candidate, base, directions, *_ in starts:
         if candidate in setting or chain.apart(candidate):
             continue
-        settings = [{**setting, candidate: tuple(base + row)} for row in directions]
+        settings = [{**plain, candidate: tuple(base + row)} for row in directions]
         moved = [((gap - chain.missing(s, rows)[:, dofs]) * weight).ravel() for s in settings]
         basis = [m / abs(m).max() for m in moved if m.any()]
         if basis and np.isfinite(basis).all():

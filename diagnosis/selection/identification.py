@@ -166,16 +166,13 @@ class Identification:
         best = min(judged, key=lambda f: f.loss)
         if best is now or not self.earned(now, best, number):
             return now
-
         good = [f for f in judged if f is not now and self.earned(now, f, number)]
         good = [f for f in good if f is best or not self.earned(f, best)]
         return min(good, key=lambda f: (complexity(f.setting), f.loss))
 
     def earned(self, before, after, number=1):
-        """Whether a set is worth its complexity, and better by no chance, for the number looked at
-        with two tests each."""
-        step = paired(before.score, after.score)
-        return after.loss < before.loss and step.p_value < LEVEL / number / 2
+        """Whether a set is worth its complexity, and better by no chance among those looked at."""
+        return after.loss < before.loss and no_chance(paired(before.score, after.score), number)
 
     def pruned(self, judge, fitted):
         """Without the effects that do not earn their place beside the others."""
@@ -199,9 +196,15 @@ class Identification:
         for node in nodes:
             if len(node.options) == len(start.options) + 1:
                 candidate = beam.columns.options[node.options[-1]].candidate
-                p = paired(start.score, node.score).p_value
-                best.setdefault(candidate, (candidate, start.loss - node.loss, p))
+                if candidate not in best:
+                    p = paired(start.score, node.score).p_value
+                    best[candidate] = candidate, start.loss - node.loss, p
         return list(best.values())
+
+
+def no_chance(step, number):
+    """Whether a Comparison is significant among a number that are looked at with two tests each."""
+    return step.p_value < LEVEL / number / 2
 
 
 def said(setting):

@@ -3,7 +3,6 @@
 event = find(world, recordings, setting, trajectory, noise)   # None, or an Event
 event.candidate, event.values                                 # a localised Candidate
 event.when                                                    # {"recording": name, "time": [a, b]}
-finding(event)                                                # as in diagnosis.json
 
 Short windows follow each other through every recording, begun at the smoothed states, which are
 free to move: what they explain is projected out. The gain of an effect that acts in windows a..b
@@ -166,36 +165,3 @@ def _part(recording, a, b):
     fields = {f: getattr(recording, f)[rows] for f in ("time", "qpos", "qvel", "ctrl")}
     sensors = {name: values[rows] for name, values in recording.sensors.items()}
     return replace(recording, **fields, sensors=sensors, start=0)
-
-
-def finding(event):
-    """The finding of an event, as diagnosis.json has it."""
-    told = _told(event.candidate, event.values)
-    for p, low, high in zip(told["parameters"], event.low, event.high):
-        p |= (
-            {"low": low, "high": high} if high > low else {"value": None, "low": None, "high": None}
-        )
-    return {
-        **told,
-        "evidence": {
-            "held_out_error_removed": 0.0,
-            "error_removed_there": event.removed,
-            "p_value": event.p_value,
-        },
-        "adequate": True,
-        "strains": None,
-        "depends_on": ["time"],
-        "when": event.when,
-        "written_as": "none",
-        "also_possible": [_told(c, values) for c, values in event.others],
-    }
-
-
-def _told(candidate, values):
-    """Effect, place and parameters of a candidate in the contract's words."""
-    place = {"kind": candidate.place.kind, "name": candidate.place.name}
-    parameters = [
-        {"name": p.name, "nominal": float(p.nominal), "value": float(v), "unit": p.unit}
-        for p, v in zip(candidate.parameters, values)
-    ]
-    return {"effect": candidate.effect.name, "place": place, "parameters": parameters}

@@ -59,8 +59,7 @@ def test_what_shows_only_beside_the_best_is_kept(monkeypatch):
     world, chain, _ = located(damping=0.09, kept=0.0)  # as a fit without dry friction has it
     monkeypatch.setattr(first_look, "EACH", 1)
     some = starts(world, "coulomb_friction", "viscous_damping", "mass", "gain", "armature")
-    alone = [kept_of(chain, some)]
-    assert {"coulomb_friction", "viscous_damping"} <= alone[0]
+    assert {"coulomb_friction", "viscous_damping"} <= kept_of(chain, some)
 
 
 def test_sensors_and_motions_that_mostly_touch_are_not_judged(scene, monkeypatch):

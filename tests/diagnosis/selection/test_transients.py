@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from plants import DRIVEN_PENDULUM, NOISE, recorded
 
+from diagnosis import findings
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.selection import transients
@@ -38,7 +39,7 @@ def found(runs, setting=None):
 
 def test_a_load_on_top_of_a_lasting_one_is_placed_in_time_and_weighed():
     event = found([loaded(2, 3.0, 4.0, (1.6, 2.4))], {("mass", "arm"): (1.5,)})
-    told = transients.finding(event)
+    told = findings.of_event(event)
     [p] = told["parameters"]
     assert told["effect"] == "payload_change" and told["written_as"] == "none"
     assert told["when"]["time"] == pytest.approx([1.6, 2.4], abs=0.03)
