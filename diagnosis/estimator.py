@@ -78,14 +78,14 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         search = Identification(world, transients.calm(train, event), say, log)
         found = search.run()
     say(0.75, "what could stand in a finding's place")
-    fitted, others = rivals.classes(search.candidates, found.judge, found.chain, found.fitted, log)
+    fitted, others = _classes(search, found, found.fitted, log)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
         fitted = search.pruned(found.judge, fitted)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
     outcome.event, outcome.earned = event, bool(outcome.fitted.setting or event)
     say(0.85, "checking what is handed over")
-    _hand_over(world, held_out or train, kept_back or held_out or train, outcome, log)
+    _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
     say(0.95, "held-out error")
     return findings.assemble(world, train, held_out, outcome)
 
@@ -112,15 +112,13 @@ def _checked(search, found, fitted, others, log):
             break
         if rest.size > NEAREST * size:
             adequacy |= {c: rest.variables for c in mine}
-    others = {c: o for c, o in others.items() if c in fitted.setting}
-    p_values = {}
-    for out in fitted.setting:
-        less = judge.fit({c: v for c, v in fitted.setting.items() if c is not out}, steps=2)
-        p_values[out] = paired(less.score, fitted.score).p_value
-    strains = {c: _strain(c, v, plausible(c, found.usual)) for c, v in fitted.setting.items()}
-    return Outcome(
-        found, fitted, trajectory, others, p_values, adequacy, strains, left, dependences
-    )
+    return Outcome(found, fitted, trajectory, others, {}, adequacy, {}, left, dependences)
+
+
+def _classes(search, found, fitted, log):
+    """(Fitted, {candidate: [(other, values)]}): the classes of its findings."""
+    some = search.candidates, found.judge, found.chain, fitted
+    return rivals.classes(*some, search.begun_anew, log)
 
 
 def _at(world, candidate, joint):
@@ -146,20 +144,30 @@ def _strain(candidate, values, prior):
     return f"{p.name} {values[k]:.3g} {p.unit}: {usual}"
 
 
-def _hand_over(world, held, kept_back, outcome, log):
-    """Fill in the Handed: what of the findings kept-back recordings need; the rest goes."""
-    setting, noise = outcome.fitted.setting, outcome.found.smoother.position_noise
+def _hand_over(search, held, kept_back, outcome, log):
+    """Fill in the Handed, what of the findings kept-back recordings do not speak against, and how
+    sure of each the judge is."""
+    world, found = search.world, outcome.found
+    setting, noise = outcome.fitted.setting, found.smoother.position_noise
     check = decides = Check(world, held, Smoother(world, held), noise)
     if kept_back is not held:
         decides = Check(world, kept_back, Smoother(world, kept_back), noise)
-    judge = outcome.found.judge
-    refit = lambda some: judge.fit(some, steps=3).setting
+    judge = found.judge
+
+    def refit(some):  # what made up for a finding that goes may be another then
+        fitted, outcome.others = _classes(search, found, judge.fit(some, steps=3), log)
+        return fitted.setting
+
     outcome.handed = accepted(world, decides, setting, refit, log, told=check)
     kept = outcome.handed.setting
-    if len(kept) < len(setting):
+    if kept != setting:
         outcome.fitted = judge.fit(kept, steps=0)
+    for c, v in kept.items():
+        less = judge.fit({other: x for other, x in kept.items() if other is not c}, steps=2)
+        outcome.p_values[c] = paired(less.score, outcome.fitted.score).p_value
+        outcome.strains[c] = _strain(c, v, plausible(c, found.usual))
     check.locate(kept)
     outcome.held_check = check
-    smoother = outcome.found.smoother
+    smoother = found.smoother
     outcome.train_check = Check(world, smoother.recordings, smoother, noise)
     outcome.train_check.trajectory = outcome.trajectory

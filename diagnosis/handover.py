@@ -16,6 +16,8 @@ import numpy as np
 from diagnosis.estimation import prediction_error, stock, windowing
 from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predictions, python_parts
 
+SCATTER = 2.0  # standard deviations that are taken for chance
+
 
 @dataclass(frozen=True)
 class Files:
@@ -94,6 +96,11 @@ class Check:
             begun[r] = replace(r, qpos=path.qpos[rows], qvel=path.qvel[rows])
         return [w._replace(recording=begun[w.recording]) for w in self.windows]
 
+    def scattered(self):
+        """Squared error, in noises, by which noise alone makes one prediction better than another:
+        SCATTER standard deviations of the mean square of as many numbers as are measured."""
+        return SCATTER * np.sqrt(2 / max(windowing.known(self.world.model, self.windows).sum(), 1))
+
     def error(self, files, windows=None):
         """As errors(), of all channels; infinite where they do not run."""
         try:
@@ -103,8 +110,9 @@ class Check:
 
 
 def accepted(world, check, setting, refit=lambda some: some, log=lambda what: None, told=None):
-    """The Handed of what of a setting earns its place on kept-back recordings, from smoothed start
-    states: together better than the nominal model, and each finding better with than without.
+    """The Handed of what of a setting kept-back recordings do not speak against, from smoothed
+    start states: neither all of it nor any finding makes a prediction worse by more than noise
+    does. Where these recordings do not show a finding, those that it was found on have decided.
     refit(setting): what is left, fitted again; told: the Check of the errors that are told."""
     nominal = Files.of(world, {})
     windows = check.smoothed()
@@ -119,7 +127,8 @@ def accepted(world, check, setting, refit=lambda some: some, log=lambda what: No
         without = {out: check.error(rest, windows) for out, rest in less.items()}
         held = [c for c in setting if files.forms[c] in ("mjcf", "python")]
         worst = min(held, key=lambda c: without[c], default=None)
-        if worst is None or without[worst] > after and after < before:
+        least = after**2 - check.scattered()
+        if worst is None or least < min(without[worst], before) ** 2:
             errors = {out: (told or check).error(rest) for out, rest in less.items()}
             return Handed(setting, files, nominal, errors)
         log(f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with")

@@ -222,7 +222,8 @@ class TorqueSpeed(DriveLimit):
         j, gear = model.actuator_trnid[i, 0], abs(model.actuator_gear[i, 0])
         _, speed = JointEffect.travel(model, j, recordings)
         fast = gear * np.quantile(speed, 0.95) + 1e-6 if len(speed) else 1.0
-        rows = [(share * used / fast, used) for share in (0.3, 0.7)] if used > 0 else []
+        stalls = (used, 0.4 * used) if used > 0 else ()
+        rows = [(share * stall / fast, stall) for stall in stalls for share in (0.3, 0.7, 1.0)]
         return np.array(rows).reshape(-1, 2)
 
     def possible(self, values, nominal):

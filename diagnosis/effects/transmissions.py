@@ -55,7 +55,7 @@ class Presliding(JointEffect):
     name, simplicity, amplitudes, related = (
         "presliding",
         3,
-        1,
+        2,
         ("coulomb_friction", "stiffness", *DISSIPATION),
     )
     acts_through = "position"

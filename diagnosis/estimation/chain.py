@@ -15,7 +15,7 @@ import numpy as np
 
 from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import Ahead
-from diagnosis.simulation.rows import RowMap
+from diagnosis.simulation.rows import RowMap, coarse
 
 
 class Chain(Ahead):
@@ -36,6 +36,9 @@ class Chain(Ahead):
         self.used = np.unique(self.rows[:, :-1][self.carried])
         beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
         self.beside = np.where(self.known, beside, 0.0)
+        # columns are differences: what a coarse step does wrong it does with an effect and without
+        self.coarse = coarse(self.world, trajectory.first)
+        self.finer = self._rows({}, self.begin) - self._rows(self.coarse, self.begin)
         self.whole = self._begun(self.windows)
         self.contacts = self._begun([self.windows[i] for i in self.touched])
         self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
@@ -94,6 +97,10 @@ class Chain(Ahead):
     def missing(self, setting, rows):
         """(rows, 2 nv): the smoothed motion less the predicted one, a row on, of rows (n,), under
         a plain setting."""
+        found = self._rows({**self.coarse, **setting}, rows)
+        return found + self.finer[np.searchsorted(self.begin, rows)]
+
+    def _rows(self, setting, rows):
         t = self.trajectory
         self.map = RowMap(self.world, list(t.first), setting, like=self.map)
         index, none = np.searchsorted(self.map.begin, rows), np.zeros((len(rows), self.model.nv))

@@ -19,6 +19,7 @@ from diagnosis.effects.environment import touchable
 from diagnosis.estimation import windowing
 from diagnosis.estimation.kalman import smooth
 from diagnosis.estimation.noise import measurement_noise
+from diagnosis.estimation.readings import beside, slopes
 from diagnosis.simulation.rows import RowMap
 
 BLOCK = 200  # rows that are smoothed as one piece
@@ -29,7 +30,8 @@ WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Smoothed motion of recordings, rows of all of them one after the other.
+    """Smoothed motion of recordings as their sensors show it, rows of all of them one after the
+    other.
 
     qpos (rows, nq), qvel (rows, nv); force (rows, nv): what the simulator lacks, mean over the row
     that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free
@@ -145,28 +147,41 @@ class Smoother:
             qpos, qvel, force = self.qpos, self.qvel, np.zeros_like(self.qvel)
         else:
             qpos, qvel, force = trajectory.qpos, trajectory.qvel, trajectory.force
+        away = self._shown(setting, qpos, qvel)
+        qpos, qvel = windowing.integrate(self.model, qpos, -away[0]), qvel - away[1]
+        shown = self._shown(setting, qpos, qvel)
+        slope = np.eye(3 * self.model.nv)
+        slope[: 2 * self.model.nv, : 2 * self.model.nv] = slopes(self.model, setting)
+        back = np.linalg.inv(slope)
         for _ in range(passes):
             free = self._touching(qpos)
-            step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
+            A, c, *rest = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
+            step = slope @ A @ back, c @ slope.T, *rest  # of what is shown
             for _ in range(UPDATES):
-                found = self._smooth(step, qpos, qvel)
+                found = self._smooth(step, qpos, qvel, shown)
                 self._update(found)
-            found = self._smooth(step, qpos, qvel)
+            found = self._smooth(step, qpos, qvel, shown)
             nv, live = self.model.nv, self.live
             state, deviation = (np.empty((len(qpos), 3 * nv)) for _ in range(2))
             state[self.index[live]], deviation[self.index[live]] = (
                 found.state[live],
                 np.sqrt(found.variance[live]),
             )
+            state = state @ back.T
             qpos = windowing.integrate(self.model, qpos, state[:, :nv])
             qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
+            shown = self._shown(setting, qpos, qvel)
+        qpos, qvel = windowing.integrate(self.model, qpos, shown[0]), qvel + shown[1]
         self.position_noise, self.velocity_noise = self._noise()
         sd = np.split(deviation, 3, axis=1)
         transition = np.tile(np.eye(2 * nv, 3 * nv), (len(qpos), 1, 1))
-        transition[~self.last] = step[0][:, : 2 * nv]
+        transition[~self.last] = A[:, : 2 * nv]
         split = np.split(transition, [2 * nv], axis=2)
         args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
         return Trajectory(*args)
+
+    def _shown(self, setting, qpos, qvel):
+        return beside(self.model, setting, self.recordings, qpos, qvel)
 
     def _touching(self, qpos):
         """Rows (N,) at or after which something touches; a force there is told by no smooth map."""
@@ -214,7 +229,7 @@ class Smoother:
         whole[:, 2 * nv :, 2 * nv :] = np.eye(nv)
         return whole, np.concatenate([drift, np.zeros((n, nv))], 1), extra, rows.seconds
 
-    def _smooth(self, step, qpos, qvel):
+    def _smooth(self, step, qpos, qvel, shown):
         A, c, extra, seconds = step
         nv, (T, b) = self.model.nv, self.index.shape
         follows = self.live & ~self.last[self.index]
@@ -227,10 +242,10 @@ class Smoother:
         noise[..., nv : 2 * nv] = extra[at]
         noise[..., 2 * nv :] = self.walk * seconds[at][..., None]
         noise[~follows] = 0.0
-        offset = np.concatenate(
-            [windowing.difference(self.model, qpos, self.qpos), self.qvel - qvel], 1
-        )
-        y = np.concatenate([offset[:, :nv] + self.position, self.velocity - qvel], 1)
+        gap = windowing.difference(self.model, qpos, self.qpos) - shown[0]
+        velocity = self.velocity - qvel - shown[1]
+        offset = np.concatenate([gap, self.qvel - qvel - shown[1]], 1)
+        y = np.concatenate([gap + self.position, velocity], 1)
         y = np.where(self.live[..., None], y[self.index], np.nan)
         first = self.index[0]
         start = np.concatenate([offset[first], np.zeros((b, nv))], 1)

@@ -125,15 +125,20 @@ def position_residual(model, windows, qpos):
     return difference(model, qpos, measured(windows))
 
 
+def known(model, windows):
+    """Whether something was measured in the rows after the first of windows, (W, T - 1, nv)."""
+    rows = measured(windows)[:, 1:]
+    return np.isfinite(difference(model, rows, rows))
+
+
 def gaps(model, windows, qpos):
     """Measured less predicted (W, T - 1, nv), 0 where nothing was measured, and where something
     was; what the reported error sums.
 
     Row 0 of a window is the start and does not count. A prediction that blew up counts as infinite.
     """
-    residual, rows = position_residual(model, windows, qpos)[:, 1:], measured(windows)[:, 1:]
-    known = np.isfinite(difference(model, rows, rows))
-    return np.where(known, np.where(abs(residual) < ENDLESS, residual, np.inf), 0.0), known
+    residual, there = position_residual(model, windows, qpos)[:, 1:], known(model, windows)
+    return np.where(there, np.where(abs(residual) < ENDLESS, residual, np.inf), 0.0), there
 
 
 def error(model, windows, qpos, noise):

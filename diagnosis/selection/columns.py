@@ -18,7 +18,7 @@ from diagnosis.selection.plausibility import plausible
 
 TOGETHER = 40  # settings that are simulated in one call
 FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column stands for it
-PROBES = 8  # starts of one candidate that are looked at, but for those that come in groups
+PROBES = 12  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
 STATES = 300  # of the motion, at which forces are compared
 PROMISING = 3  # groups of starts that are simulated
@@ -82,6 +82,14 @@ def applied(model, qpos, qvel, working):
     return out
 
 
+def _usual(candidate, probes, prior):
+    """Starts of an effect, their amplitudes as large as the machine's forces let expect."""
+    n, rows = candidate.effect.amplitudes, np.array(probes, float)
+    if n and len(rows) and np.isfinite(prior.scale[0]) and len(set(rows[:, 0])) == 1:
+        rows[:, :n] *= LADDER[0] * prior.scale[0] / rows[0, 0]
+    return list(rows)
+
+
 class Columns:
     """Simulates the columns of candidates about a setting. residual (W, T, nv); array (W, T, nv,
     K); options."""
@@ -122,7 +130,7 @@ class Columns:
                 return out
             whole = list(world.far(candidate, recordings)) + self._ladder(base, prior)
         else:
-            out, whole = [], list(world.probes(candidate, recordings))
+            out, whole = [], _usual(candidate, world.probes(candidate, recordings), prior)
         together = candidate.effect.together
         if together == 1 and len(whole) > PROBES:
             some = np.unique(np.linspace(0, len(whole) - 1, PROBES).astype(int))

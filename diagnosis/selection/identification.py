@@ -11,7 +11,7 @@ from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
-from diagnosis.selection.beam import Beam
+from diagnosis.selection.beam import LEAST, Beam
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.judge import Fitted, Judge
@@ -99,11 +99,11 @@ class Identification:
         now = judge.fit(setting)
         judge.reference = now.evidence.floor
         judged = {now: judge}
-        for node in self._finalists(beam, start, nodes):
-            fitted, by = self._begun_anew(judge, judge.fit(beam.setting(node), steps=3))
+        number = len(every) + len(curves)
+        for node in self._finalists(beam, start, nodes, number):
+            fitted, by = self.begun_anew(judge, judge.fit(beam.setting(node), steps=3))
             self.log(f"  linear {node.loss:.3f} judged {fitted.loss:.3f} {said(fitted.setting)}")
             judged[fitted] = by
-        number = len(every) + len(curves)
         best = self._choose(list(judged), now, number)
         if best is not now:
             judge = judged[best]
@@ -122,7 +122,7 @@ class Identification:
         found = [d for d in found if d.variables != (f"velocity:{d.joint}",)]
         return [(d.candidate, d.values) for d in found if d.joint not in taken][:CURVES]
 
-    def _begun_anew(self, judge, fitted):
+    def begun_anew(self, judge, fitted):
         """(Fitted again, its Judge) from the start states that the recordings have under a set: of
         a poor model's motion they are too uncertain to tell a good one."""
         smoother, trajectory, ahead = copy(self.smoother), self.trajectory, copy(judge.ahead)
@@ -145,17 +145,22 @@ class Identification:
         self.idle |= {c for c, gain in most.items() if c not in chosen.setting and gain < IDLE}
 
     @staticmethod
-    def _finalists(beam, start, nodes):
-        """Nodes for the simulator, best first: of other effects, and not a better one and more."""
+    def _finalists(beam, start, nodes, number):
+        """Nodes for the simulator, best first: of other effects, not a better one and more, and not
+        one that predicts the same: classes are told later. A column begun far from the truth may
+        not be worth its price yet, but no chance."""
         chosen, seen = [], []
         for node in nodes:
-            if node.loss >= start.loss or len(chosen) == FINALISTS:
+            if len(chosen) == FINALISTS:
                 break
+            if node.loss >= start.loss and not no_chance(paired(start.score, node.score), number):
+                continue
             options = beam.columns.options
             added = [options[k].candidate for k in node.options[len(start.options) :]]
             # curves of one joint are one explanation of its force
             names = {c.place if isinstance(c.effect, Unknown) else c for c in added}
-            if not any(names >= better for better in seen):
+            same = [abs(node.score.groups - c.score.groups).max() < LEAST for c in chosen]
+            if not any(same) and not any(names >= better for better in seen):
                 seen.append(names)
                 chosen.append(node)
         return chosen

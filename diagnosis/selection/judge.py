@@ -15,7 +15,7 @@ from diagnosis.selection.plausibility import at_limit, plausible, possible
 
 STEPS = 6  # Gauss-Newton steps of a refit, at most
 DONE = 2e-3  # loss that another step would still remove, from which on a refit is done
-HALVINGS = 3  # of a step that does not lower the loss
+THIRDS = 3  # shares of a step that are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,17 +66,20 @@ class Judge:
         return Fitted(setting, final, columns, evidence)
 
     def _lower(self, columns, evidence, amounts, setting):
-        """(setting, residual) after a step that lowers the loss by more than DONE, or None."""
-        inside = self._whole(columns.residual, setting, evidence)
-        share = 1.0
-        for _ in range(HALVINGS):
+        """(setting, residual) after a step that lowers the loss by more than DONE, or None: of the
+        whole step and thirds of it, the first that is better than the next."""
+        least, best, share = self._whole(columns.residual, setting, evidence) - DONE, None, 1.0
+        for _ in range(THIRDS):
             moved = moved_setting(columns, share * amounts)
+            share /= 3
             if np.isfinite(self.cost(moved)):
                 residual = self.ahead.residual([moved])[0]
-                if self._whole(residual, moved, evidence) < inside - DONE:
-                    return moved, residual
-            share /= 3
-        return None
+                found = self._whole(residual, moved, evidence)
+                if found < least:
+                    least, best = found, (moved, residual)
+                elif best:
+                    break
+        return best
 
     def _whole(self, residual, setting, evidence):
         """Loss of a residual with nothing left out, priors included."""

@@ -1,7 +1,7 @@
 """What could stand in a finding's place: effects whose refits predict as well, told as a class, the
 best for its price first.
 
-fitted, others = classes(candidates, judge, chain, fitted)
+fitted, others = classes(candidates, judge, chain, fitted, anew)
 others[candidate]                                    # [(other, values), ...]
 """
 
@@ -19,14 +19,15 @@ FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
-def classes(candidates, judge, chain, fitted, log=lambda what: None):
+def classes(candidates, judge, chain, fitted, anew, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
-    its price, and the other members. Among equals the finding stays."""
+    its price, and the other members. Among equals the finding stays. anew(judge, fitted): (Fitted,
+    its Judge), from the start states that it has itself."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting:
             continue
-        members = _members(candidates, judge, chain, fitted, candidate)
+        members = _members(candidates, judge, chain, fitted, candidate, anew)
         units, most = complexity(fitted.setting), fitted.loss - TIED
         better = [m for m in members if m[0].loss < most or complexity(m[0].setting) < units]
         members.append((fitted, candidate))
@@ -40,7 +41,7 @@ def classes(candidates, judge, chain, fitted, log=lambda what: None):
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
 
-def _members(candidates, judge, chain, fitted, candidate):
+def _members(candidates, judge, chain, fitted, candidate, anew):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
     their price, best first."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
@@ -49,6 +50,8 @@ def _members(candidates, judge, chain, fitted, candidate):
     out = []
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
+        if other.effect.overrides("measure"):  # shows other states at a window's start
+            tried = anew(judge, tried)[0]
         tied = tried.score.loss < fitted.score.loss + TIED
         if tried.settled and (tied or tried.loss < fitted.loss):
             out.append((tried, other))
@@ -57,7 +60,8 @@ def _members(candidates, judge, chain, fitted, candidate):
 
 def _alike(judge, chain, fitted, candidate, pool):
     """[(other, values)] with columns like the candidate's force beside the other findings', most
-    alike first.
+    alike first; of sensors that are off, whose columns begin at states that they would not show,
+    those that are related, too.
 
     Asked at the model without the finding, for what is gone there is what the others have to
     explain.
@@ -70,18 +74,22 @@ def _alike(judge, chain, fitted, candidate, pool):
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]
     index = [i for k in kept for i in columns.options[k].columns]
     bare = _left(evidence, index)
-    out = {}
+    here = chain.world.joints(candidate.place) is not None
+    out, related = {}, set(chain.world.related(candidate)) if here else set()
     for option in columns.options:
         if option.candidate in rest:
             continue
         left = _left(evidence, [*index, *option.columns])
         cosine = np.sqrt(max(1 - left / max(bare, 1e-300), 0.0))
-        if cosine < ALIKE:
+        shifted = option.candidate in related and option.candidate.effect.overrides("measure")
+        if cosine < ALIKE and not shifted:
             continue
         wide = np.full(len(option.columns), np.inf)
         none = np.zeros(len(wide))
         score = evidence.score(option.columns, -wide, wide, none, none)
         values = option.values(np.clip(score.amounts, option.low, option.high))
+        if shifted:  # a delay as long
+            values = fitted.setting[candidate][: len(values)]
         if cosine > out.get(option.candidate, (0.0,))[0]:
             out[option.candidate] = cosine, values
     return [(c, v) for c, (_, v) in sorted(out.items(), key=lambda item: -item[1][0])]

@@ -70,3 +70,24 @@ def test_a_window_that_begins_in_a_hole_of_the_recording_is_predicted_by_the_scr
     run.qpos[windows[1].first] = np.nan
     files = Files.of(world, {world.candidate("dead_zone", "drive"): (0.2,)})
     assert np.isfinite(files.predicted(world.model, windows)[1, 1:]).all()
+
+
+def test_what_kept_back_recordings_do_not_show_stays_and_what_they_speak_against_goes(kept_back):
+    world, check = kept_back
+    truth = {world.candidate("viscous_damping", "pivot"): (0.1,)}
+    stop = world.candidate("bias", "drive")  # of so little that it is lost in the noise
+    assert set(accepted(world, check, {**truth, stop: (1e-5,)}).setting) == {*truth, stop}
+    errors = [
+        check.error(Files.of(world, {**truth, stop: (x,)}), check.smoothed()) for x in (0.0, 0.02)
+    ]
+    assert errors[1] ** 2 > errors[0] ** 2 + check.scattered()
+    assert set(accepted(world, check, {**truth, stop: (0.02,)}).setting) == set(truth)
+
+
+def test_noise_makes_predictions_better_or_worse_by_its_mean_square():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    run = recorded("run.csv", 1, seconds=6.0)
+    check = Check(world, [run], Smoother(world, [run]), np.array([NOISE]))
+    rows = sum(w.last - w.first for w in check.windows)
+    drawn = np.random.default_rng(0).normal(size=(2000, rows))
+    assert check.scattered() == pytest.approx(2 * np.std((drawn**2).mean(1)), rel=0.1)

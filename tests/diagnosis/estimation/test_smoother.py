@@ -149,3 +149,40 @@ def test_transitions_taken_over_lead_to_the_same_motion():
     assert scale > 1e-3
     np.testing.assert_allclose(found[True].force, found[False].force, atol=0.05 * scale)
     np.testing.assert_allclose(found[True].qpos, found[False].qpos, atol=1e-5)
+
+
+def shown(offset, ratio, late, rows=300):
+    """(Recording, truly shown positions (rows,)) of a pendulum whose encoder is off: late by so
+    many steps of 5 ms."""
+    rng, model = np.random.default_rng(3), mujoco.MjModel.from_xml_string(PENDULUM)
+    data, time = mujoco.MjData(model), 0.01 * np.arange(rows)
+    ctrl = 0.5 * np.sin(7 * time)[:, None] + 0.4 * np.cos(11 * time)[:, None]
+    path = []
+    for t in range(rows):
+        data.ctrl[:] = ctrl[t]
+        for _ in range(2):
+            path.append(data.qpos[0])
+            mujoco.mj_step(model, data)
+    true = np.array(path)[np.maximum(2 * np.arange(rows) - late, 0)]
+    seen = ratio * true + offset
+    noisy = (seen + NOISE * rng.normal(size=rows))[:, None]
+    return Recording("off.csv", time, noisy, np.full(noisy.shape, np.nan), ctrl), seen
+
+
+@pytest.mark.parametrize(
+    "name, value, off",
+    [
+        ("sensor_delay", 0.015, (0.0, 1.0, 3)),
+        ("sensor_bias", 0.3, (0.3, 1.0, 0)),
+        ("sensor_scale", 1.3, (0.0, 1.3, 0)),
+    ],
+)
+def test_a_sensor_that_is_off_is_no_missing_force(name, value, off):
+    run, seen = shown(*off)
+    world = World(mujoco.MjSpec.from_string(PENDULUM))
+    under = Smoother(world, [run]).locate({world.candidate(name, "j"): (value,)})
+    plain = Smoother(world, [run]).locate({})
+    forces = [np.sqrt(np.mean(t.force[5:-5] ** 2)) for t in (under, plain)]
+    assert forces[0] < 0.1 * forces[1]
+    # what is told are states as the sensor shows them
+    assert np.sqrt(np.mean((under.qpos[5:-5, 0] - seen[5:-5]) ** 2)) < 0.5 * NOISE

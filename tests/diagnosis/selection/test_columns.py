@@ -93,3 +93,13 @@ def test_a_column_at_full_size_tells_friction_that_a_small_step_does_not(scene):
     assert best == pytest.approx(0.05, rel=0.3)
     assert losses[best] < evidence.score((), *[np.zeros(0)] * 4).loss - 0.5
     assert NOISE > 0
+
+
+def test_amplitudes_are_begun_at_forces_that_the_machine_has(scene):
+    world, ahead, usual = scene
+    for name in ("friction_map", "stribeck_friction", "presliding"):
+        candidate = world.candidate(name, "pivot")
+        prior = plausible(candidate, usual)
+        for option in Columns(ahead, {}, usual, [candidate]).options:
+            begun = option.base[0] + option.directions[0, 0]
+            assert begun == pytest.approx(0.1 * prior.scale[0]), name

@@ -65,3 +65,25 @@ def test_a_set_is_chosen_for_its_worth(search):
     assert search._choose([now, friction, both, bound], now, 10) is friction
     assert search._choose([now, friction, better], now, 10) is better
     assert search._choose([now, little], now, 10) is now  # not worth its price
+
+
+def node(losses, price, *names):
+    """A Node of a beam with these losses of groups; names: indices of its options."""
+    groups = np.array(losses, float)
+    score = Score(groups.mean(), groups, (), 3)
+    return SimpleNamespace(options=names, score=score, loss=groups.mean() + price)
+
+
+def test_finalists_are_worth_their_price_or_no_chance_and_predict_differently(search):
+    noise = 1e-3 * np.arange(16)
+    named = [search.world.candidates[k] for k in range(5)]
+    effects = [SimpleNamespace(candidate=candidate) for candidate in named]
+    beam = SimpleNamespace(columns=SimpleNamespace(options=effects))
+    start = node(noise, 0.0)
+    worth = node(noise - 0.5, 0.1, 0)
+    dear = node(noise - 0.4 + 2e-3 * np.arange(16)[::-1], 0.6, 1)  # seen everywhere all the same
+    same = node(noise - 0.5 + 1e-3, 0.2, 2)
+    luck = node(noise + np.where(np.arange(16) == 3, -3.0, 0.0), 0.6, 3)
+    more = node(noise - 0.7, 0.3, 0, 4)
+    nodes = sorted([worth, dear, same, luck, more], key=lambda n: n.loss)
+    assert Identification._finalists(beam, start, nodes, 10) == [more, worth, dear]

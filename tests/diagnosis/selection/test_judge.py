@@ -99,7 +99,7 @@ def test_back_emf_and_viscous_damping_are_one_class():
     pool = [c for c in world.candidates if c.effect.name in names]
     for found in (damping, back_emf):
         fitted = judge.fit({found: (0.1,)})
-        again, others = rivals.classes(pool, judge, along(judge), fitted)
+        again, others = rivals.classes(pool, judge, along(judge), fitted, None)
         [named] = again.setting
         told = {named, *(c for c, _ in others[named])}
         assert {damping, back_emf} <= told
@@ -116,6 +116,6 @@ def test_what_is_no_equal_is_not_told():
     fitted = judge.fit({friction: (0.05,)})
     others = "gain", "stiffness", "mass", "delay", "viscous_damping", "gravity", "bias"
     pool = [c for c in world.candidates if c.effect.name in others]
-    again, told = rivals.classes(pool, judge, along(judge), fitted)
+    again, told = rivals.classes(pool, judge, along(judge), fitted, None)
     assert list(again.setting) == [friction]
     assert told[friction] == []

@@ -13,7 +13,8 @@ class Named:
 
     def __init__(self, name, units):
         self.name = name
-        self.effect = SimpleNamespace(simplicity=units - 1, name=name)
+        overrides = {"overrides": lambda what: False}
+        self.effect = SimpleNamespace(simplicity=units - 1, name=name, **overrides)
         self.parameters = (None,)
 
 
@@ -37,7 +38,7 @@ def chosen(monkeypatch, fitted, losses):
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
     start = Judge().fit({names[fitted]: (2.0,)})
-    found, told = rivals.classes([DRY, CURVED], Judge(), None, start)
+    found, told = rivals.classes([DRY, CURVED], Judge(), None, start, None)
     return [c.name for c in found.setting], {
         c.name: [o.name for o, _ in each] for c, each in told.items()
     }
