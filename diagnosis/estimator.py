@@ -78,7 +78,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         search = Identification(world, transients.calm(train, event), say, log)
         found = search.run()
     say(0.75, "what could stand in a finding's place")
-    fitted, others = _classes(search, found, found.fitted, log)
+    fitted, others = _classes(search, found, found.fitted, log, search.candidates)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
         fitted = search.pruned(found.judge, fitted)
     say(0.8, "testing for anything left")
@@ -115,9 +115,9 @@ def _checked(search, found, fitted, others, log):
     return Outcome(found, fitted, trajectory, others, {}, adequacy, {}, left, dependences)
 
 
-def _classes(search, found, fitted, log):
-    """(Fitted, {candidate: [(other, values)]}): the classes of its findings."""
-    some = search.candidates, found.judge, found.chain, fitted
+def _classes(search, found, fitted, log, candidates):
+    """(Fitted, {candidate: [(other, values)]}): the classes of its findings among candidates."""
+    some = candidates, found.judge, found.chain, fitted
     return rivals.classes(*some, search.begun_anew, log)
 
 
@@ -154,8 +154,11 @@ def _hand_over(search, held, kept_back, outcome, log):
         decides = Check(world, kept_back, Smoother(world, kept_back), noise)
     judge = found.judge
 
-    def refit(some):  # what made up for a finding that goes may be another then
-        fitted, outcome.others = _classes(search, found, judge.fit(some, steps=3), log)
+    pool = list(search.candidates)
+
+    def refit(some, out):  # what made up for a finding that goes may be another then
+        pool[:] = [c for c in pool if c is not out]
+        fitted, outcome.others = _classes(search, found, judge.fit(some, steps=3), log, pool)
         return fitted.setting
 
     outcome.handed = accepted(world, decides, setting, refit, log, told=check)

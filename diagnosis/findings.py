@@ -20,8 +20,6 @@ ENOUGH = 0.5  # of the error that findings remove, up to which what is left leav
 COLOURED = 3.0  # of its error under white noise, what noise of another kind may reach
 POINTS = 400  # of a located force that are told
 
-UNSEEN = "{} helps to predict, at no value that the recordings show: it is written, and no finding"
-
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -74,7 +72,7 @@ def assemble(world, train, held_out, outcome):
             "place": {"kind": "joint", "name": hint.joint} if hint else None,
             "depends_on": list(hint.variables) if hint else [],
         },
-        "warnings": [UNSEEN.format(c) for c in settings if not seen(bounds[c])],
+        "warnings": [],
     }
     return Diagnosis(
         summary,
@@ -93,7 +91,7 @@ def assemble(world, train, held_out, outcome):
 def _findings(world, outcome, bounds, figure):
     """All findings, the most important first: of the model, of a while, of sensors."""
     settings = outcome.fitted.setting
-    found = [_finding(world, c, outcome, bounds, figure) for c in settings if seen(bounds[c])]
+    found = [_finding(world, c, outcome, bounds, figure) for c in settings]
     if outcome.event:
         found.append(of_event(outcome.event))
     recordings = outcome.found.smoother.recordings
@@ -169,13 +167,8 @@ def of_event(event):
 
 def certain(candidate, bounds):
     """Whether the interval of some value leaves out the nominal one."""
-    shown = [(p, b) for p, b in zip(candidate.parameters, bounds) if b is not None]
-    return any(not low <= p.nominal <= high for p, (low, high) in shown)
-
-
-def seen(bounds):
-    """Whether the recordings show any of an effect's values."""
-    return any(b is not None for b in bounds)
+    seen = [(p, b) for p, b in zip(candidate.parameters, bounds) if b is not None]
+    return any(not low <= p.nominal <= high for p, (low, high) in seen)
 
 
 def enough(left, before, after):

@@ -73,7 +73,7 @@ class Check:
         """noise (nv,): of positions, as it is reported, whatever these recordings alone show."""
         self.world, self.recordings, self.smoother = world, recordings, smoother
         self.windows = prediction_error.consecutive(recordings, windowing.HORIZON)
-        self.noise = prediction_error.reporting_noise(noise)
+        self.noise, self.told = prediction_error.reporting_noise(noise), np.isfinite(noise)
         self.trajectory, self.scatter = None, 0.0
 
     def locate(self, setting):
@@ -98,8 +98,10 @@ class Check:
 
     def scattered(self):
         """Squared error, in noises, by which noise alone makes one prediction better than another:
-        SCATTER standard deviations of the mean square of as many numbers as are measured."""
-        return SCATTER * np.sqrt(2 / max(windowing.known(self.world.model, self.windows).sum(), 1))
+        SCATTER standard deviations of the mean square of what is measured, as far as its noise is
+        told."""
+        known = windowing.known(self.world.model, self.windows)
+        return SCATTER * np.sqrt(2 * known[..., self.told].sum()) / max(known.sum(), 1)
 
     def error(self, files, windows=None):
         """As errors(), of all channels; infinite where they do not run."""
@@ -109,11 +111,12 @@ class Check:
             return np.inf
 
 
-def accepted(world, check, setting, refit=lambda some: some, log=lambda what: None, told=None):
+def accepted(world, check, setting, refit=lambda some, out: some, log=lambda what: None, told=None):
     """The Handed of what of a setting kept-back recordings do not speak against, from smoothed
     start states: neither all of it nor any finding makes a prediction worse by more than noise
     does. Where these recordings do not show a finding, those that it was found on have decided.
-    refit(setting): what is left, fitted again; told: the Check of the errors that are told."""
+    refit(setting, out): what is left without one, fitted again; told: the Check of the errors that
+    are told."""
     nominal = Files.of(world, {})
     windows = check.smoothed()
     before = check.error(nominal, windows)
@@ -132,4 +135,4 @@ def accepted(world, check, setting, refit=lambda some: some, log=lambda what: No
             errors = {out: (told or check).error(rest) for out, rest in less.items()}
             return Handed(setting, files, nominal, errors)
         log(f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with")
-        setting = refit({c: v for c, v in setting.items() if c is not worst})
+        setting = refit({c: v for c, v in setting.items() if c is not worst}, worst)

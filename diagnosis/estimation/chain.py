@@ -22,7 +22,8 @@ class Chain(Ahead):
     """An Ahead whose predictions are linear in what happens in each row. Windows in which something
     touches, and effects with states or sensors of their own, are simulated as in Ahead."""
 
-    def start(self, trajectory):
+    def start(self, trajectory, setting=None):
+        """Begin the windows at a Trajectory's states; setting: that under which it was located."""
         super().start(trajectory)
         self.trajectory, self.map = trajectory, None
         last = np.array([w.last - w.first for w in self.windows])
@@ -37,8 +38,9 @@ class Chain(Ahead):
         beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
         self.beside = np.where(self.known, beside, 0.0)
         # columns are differences: what a coarse step does wrong it does with an effect and without
-        self.coarse = coarse(self.world, trajectory.first)
-        self.finer = self._rows({}, self.begin) - self._rows(self.coarse, self.begin)
+        self.coarse, base = coarse(self.world, trajectory.first), self.plain(setting or {})
+        rough = self._rows({**self.coarse, **base}, self.begin)
+        self.finer = self._rows(base, self.begin) - rough
         self.whole = self._begun(self.windows)
         self.contacts = self._begun([self.windows[i] for i in self.touched])
         self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)

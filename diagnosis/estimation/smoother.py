@@ -24,6 +24,7 @@ from diagnosis.simulation.rows import RowMap
 
 BLOCK = 200  # rows that are smoothed as one piece
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
+BACK = 2  # turns from what a late sensor shows to the motion: more would amplify noise
 MOST = 10.0  # factor of a variance in one update
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
 
@@ -147,8 +148,10 @@ class Smoother:
             qpos, qvel, force = self.qpos, self.qvel, np.zeros_like(self.qvel)
         else:
             qpos, qvel, force = trajectory.qpos, trajectory.qvel, trajectory.force
-        away = self._shown(setting, qpos, qvel)
-        qpos, qvel = windowing.integrate(self.model, qpos, -away[0]), qvel - away[1]
+        seen = qpos, qvel
+        for _ in range(BACK):  # from what is shown to what is
+            away = self._shown(setting, qpos, qvel)
+            qpos, qvel = windowing.integrate(self.model, seen[0], -away[0]), seen[1] - away[1]
         shown = self._shown(setting, qpos, qvel)
         slope = np.eye(3 * self.model.nv)
         slope[: 2 * self.model.nv, : 2 * self.model.nv] = slopes(self.model, setting)

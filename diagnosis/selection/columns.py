@@ -87,6 +87,7 @@ def _usual(candidate, probes, prior):
     n, rows = candidate.effect.amplitudes, np.array(probes, float)
     if n and len(rows) and np.isfinite(prior.scale[0]) and len(set(rows[:, 0])) == 1:
         rows[:, :n] *= LADDER[0] * prior.scale[0] / rows[0, 0]
+        rows = np.clip(rows, prior.low, prior.high)
     return list(rows)
 
 

@@ -65,7 +65,7 @@ class Identification:
         setting, ranking = {}, []
         for i in range(ROUNDS):
             self.ahead.start(trajectory)
-            self.screen.start(trajectory)
+            self.screen.start(trajectory, setting)
             self.trajectory = trajectory
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
             fitted, better, look = self._round(setting)
@@ -75,7 +75,7 @@ class Identification:
             setting = fitted.setting
             trajectory = smoother.locate(setting, trajectory, passes=1)
         self.ahead.start(trajectory)
-        self.screen.start(trajectory)
+        self.screen.start(trajectory, setting)
         judge = Judge(self.ahead, self.usual, seen=self.seen)
         fitted = judge.fit(setting)
         return Found(fitted, trajectory, first, smoother, self.usual, judge, self.screen, ranking)
@@ -98,7 +98,8 @@ class Identification:
         judge = Judge(self.ahead, self.usual, seen=self.seen)
         now = judge.fit(setting)
         judge.reference = now.evidence.floor
-        judged = {now: judge}
+        now, by = self.begun_anew(judge, now) if setting else (now, judge)
+        judged = {now: by}
         number = len(every) + len(curves)
         for node in self._finalists(beam, start, nodes, number):
             fitted, by = self.begun_anew(judge, judge.fit(beam.setting(node), steps=3))
@@ -110,7 +111,8 @@ class Identification:
             best = self.pruned(judge, judge.fit(best.setting))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
             self._set_aside(beam, columns, best)
-        return best, best is not now, [] if setting else self._ranking(beam, start, nodes)
+        better = best.setting.keys() != setting.keys()
+        return best, better, [] if setting else self._ranking(beam, start, nodes)
 
     def _curves(self, setting):
         """[(candidate, values)] of forces without a name, in joints that no effect of a setting has

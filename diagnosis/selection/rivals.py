@@ -22,12 +22,12 @@ REFITS, MOST = 4, 3  # others that are refitted, and told
 def classes(candidates, judge, chain, fitted, anew, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
     its price, and the other members. Among equals the finding stays. anew(judge, fitted): (Fitted,
-    its Judge), from the start states that it has itself."""
+    its Judge), from the start states under its own set."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting:
             continue
-        members = _members(candidates, judge, chain, fitted, candidate, anew)
+        members = _members(candidates, judge, chain, fitted, candidate)
         units, most = complexity(fitted.setting), fitted.loss - TIED
         better = [m for m in members if m[0].loss < most or complexity(m[0].setting) < units]
         members.append((fitted, candidate))
@@ -37,11 +37,12 @@ def classes(candidates, judge, chain, fitted, anew, log=lambda what: None):
             swapped = True
         tied = [(f, o) for f, o in members if f.score.loss < fitted.score.loss + TIED]
         others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
+        others[own] += _late(candidates, judge, chain, fitted, own, anew)
     others = {c: each[:MOST] for c, each in others.items() if c in fitted.setting}
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
 
-def _members(candidates, judge, chain, fitted, candidate, anew):
+def _members(candidates, judge, chain, fitted, candidate):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
     their price, best first."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
@@ -50,18 +51,34 @@ def _members(candidates, judge, chain, fitted, candidate, anew):
     out = []
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
-        if other.effect.overrides("measure"):  # shows other states at a window's start
-            tried = anew(judge, tried)[0]
         tied = tried.score.loss < fitted.score.loss + TIED
         if tried.settled and (tied or tried.loss < fitted.loss):
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
 
+def _late(candidates, judge, chain, fitted, candidate, anew):
+    """[(other, values)] of a delay in the drive for one in the sensor, or the other way round, that
+    predict as well: both begin at states of their own, for a late sensor shows others."""
+    late = lambda c: c.effect.overrides("measure") and c.effect.measure((1.0,) * 3)[2] > 0
+    world = chain.world
+    pool = [c for c in world.related(candidate) if c in candidates and c not in fitted.setting]
+    pool = [c for c in pool if late(c) != late(candidate) and world.joints(c.place)]
+    if not pool or not world.joints(candidate.place):
+        return []
+    least, out = anew(judge, fitted)[0].score.loss + TIED, []
+    for other in pool:
+        rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
+        tried = judge.fit({**rest, other: fitted.setting[candidate]}, steps=0)
+        tried = anew(judge, tried)[0]
+        if tried.settled and tried.score.loss < least:
+            out.append((other, tried.setting[other]))
+    return out
+
+
 def _alike(judge, chain, fitted, candidate, pool):
     """[(other, values)] with columns like the candidate's force beside the other findings', most
-    alike first; of sensors that are off, whose columns begin at states that they would not show,
-    those that are related, too.
+    alike first.
 
     Asked at the model without the finding, for what is gone there is what the others have to
     explain.
@@ -74,22 +91,18 @@ def _alike(judge, chain, fitted, candidate, pool):
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]
     index = [i for k in kept for i in columns.options[k].columns]
     bare = _left(evidence, index)
-    here = chain.world.joints(candidate.place) is not None
-    out, related = {}, set(chain.world.related(candidate)) if here else set()
+    out = {}
     for option in columns.options:
         if option.candidate in rest:
             continue
         left = _left(evidence, [*index, *option.columns])
         cosine = np.sqrt(max(1 - left / max(bare, 1e-300), 0.0))
-        shifted = option.candidate in related and option.candidate.effect.overrides("measure")
-        if cosine < ALIKE and not shifted:
+        if cosine < ALIKE:
             continue
         wide = np.full(len(option.columns), np.inf)
         none = np.zeros(len(wide))
         score = evidence.score(option.columns, -wide, wide, none, none)
         values = option.values(np.clip(score.amounts, option.low, option.high))
-        if shifted:  # a delay as long
-            values = fitted.setting[candidate][: len(values)]
         if cosine > out.get(option.candidate, (0.0,))[0]:
             out[option.candidate] = cosine, values
     return [(c, v) for c, (_, v) in sorted(out.items(), key=lambda item: -item[1][0])]

@@ -9,7 +9,7 @@ import numpy as np
 from mujoco import rollout
 
 from diagnosis.common.coordinates import difference, integrate
-from diagnosis.effects.base import runge_kutta
+from diagnosis.effects.base import JOINT_TRANSMISSIONS, runge_kutta
 from diagnosis.simulation.batch import threads
 from diagnosis.simulation.control_signal import SLACK
 from diagnosis.simulation.simulator import Case
@@ -17,6 +17,7 @@ from diagnosis.simulation.simulator import Case
 INPUT = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 CHUNK = 40000  # simulations in memory at a time
 STEPS, COARSER = 2, 4.0  # coarse ones in a row, no longer than so many of the simulator's
+SWING = 0.3  # rad that the stiffest servo or spring swings in one, or its damper's share
 SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per second, of the force
 
 
@@ -25,7 +26,23 @@ def coarse(world, recordings):
     [step] = [c for c in world.candidates if c.effect.name == "time_step"]
     own = world.model.opt.timestep
     seconds = np.median(np.concatenate([np.diff(r.time) for r in recordings])) / STEPS
-    return {step: (float(np.clip(seconds, own, COARSER * own)),)}
+    seconds = min(seconds, COARSER * own, SWING / max(_fastest(world.model), 1e-9))
+    return {step: (float(max(seconds, own)),)}
+
+
+def _fastest(model):
+    """The highest rate, 1/s, at which a joint's springs, dampers and servos act on its inertia."""
+    stiff, slow = np.zeros(model.nv), model.dof_damping.copy()
+    for j in range(model.njnt):
+        stiff[model.jnt_dofadr[j]] = model.jnt_stiffness[j]
+    for a in range(model.nactuator):
+        if model.actuator_trntype[a] in JOINT_TRANSMISSIONS:
+            d = model.jnt_dofadr[model.actuator_trnid[a, 0]]
+            gear = model.actuator_gear[a, 0] ** 2
+            stiff[d] -= gear * model.actuator_biasprm[a, 1]
+            slow[d] -= gear * model.actuator_biasprm[a, 2]
+    yields = model.dof_invweight0
+    return float(np.maximum(np.sqrt(np.maximum(stiff, 0.0) * yields), slow * yields).max(initial=0))
 
 
 class RowMap:

@@ -8,6 +8,7 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
+from diagnosis.simulation import rows
 from diagnosis.simulation.simulator import World
 
 VISCOUS, DRY = {"viscous_damping": (0.2,)}, {"coulomb_friction": (0.1,)}
@@ -64,3 +65,33 @@ def test_what_is_no_force_is_simulated(here):
     ahead.start(chain.trajectory)
     along, simulated = (a.residual([{}, {sensor: (1.1,)}]) for a in (chain, ahead))
     np.testing.assert_allclose(along[1] - along[0], simulated[1] - simulated[0], atol=1e-12)
+
+
+def test_coarse_steps_invent_nothing_under_the_effects_that_located_the_motion(here, monkeypatch):
+    world, truth, chain = here
+    trajectory = Smoother(world, list(chain.trajectory.first)).locate(truth)
+    found = []
+    for steps in (rows.COARSER, 1.0):
+        monkeypatch.setattr(rows, "COARSER", steps)
+        some = Chain(world, chain.windows, chain.noise)
+        some.start(trajectory, truth)
+        more = {**truth, world.candidate("gain", "drive"): (1.1,)}
+        found.append(some.residual([truth, more]))
+    rough, fine = found
+    np.testing.assert_allclose(rough[0], fine[0], atol=1e-9)
+    x, y = (rough[1] - rough[0]).ravel(), (fine[1] - fine[0]).ravel()
+    assert x @ y / np.sqrt((x @ x) * (y @ y)) > 0.999
+
+
+@pytest.mark.parametrize("kp", [0.0, 40.0, 4000.0])
+def test_coarse_steps_are_no_longer_than_the_stiffest_servo_allows(kp):
+    xml = DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)
+    spec = mujoco.MjSpec.from_string(xml)
+    if kp:
+        spec.actuators[0].set_to_position(kp=kp)
+    world = World(spec)
+    own = world.model.opt.timestep
+    [(_, (step,))] = rows.coarse(world, [recorded("run.csv", 1, seconds=2.0)]).items()
+    inertia = 1 / world.model.dof_invweight0[0]
+    assert own <= step <= max(own, 0.3 / np.sqrt(max(kp, 1e-9) / inertia)) + 1e-12
+    assert (step > own) == (kp < 1000)

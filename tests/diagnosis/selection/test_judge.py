@@ -1,5 +1,7 @@
 """Refits in the simulator recover what was put into stock MuJoCo; equals are told as a class."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
@@ -119,3 +121,27 @@ def test_what_is_no_equal_is_not_told():
     again, told = rivals.classes(pool, judge, along(judge), fitted, None)
     assert list(again.setting) == [friction]
     assert told[friction] == []
+
+
+def test_a_late_sensor_is_told_beside_a_late_drive_each_from_its_own_start_states():
+    judge = judge_of()
+    world, asked = judge.ahead.world, []
+    delay, late = world.candidate("delay", "drive"), world.candidate("sensor_delay", "pivot")
+    fitted = judge.fit({delay: (0.01,)}, steps=0)
+
+    def anew(by, set_of_one):
+        [c] = set_of_one.setting
+        asked.append(c)
+        return SimpleNamespace(
+            setting={c: (0.01,)}, settled=True, score=SimpleNamespace(loss=losses[c])
+        ), by
+
+    chain = SimpleNamespace(world=world)
+    losses = {delay: -1.0, late: -0.95}
+    assert rivals._late(world.candidates, judge, chain, fitted, delay, anew) == [(late, (0.01,))]
+    assert asked == [delay, late]
+    losses = {delay: -1.0, late: -0.8}
+    assert rivals._late(world.candidates, judge, chain, fitted, delay, anew) == []
+    friction = judge.fit({world.candidate("coulomb_friction", "pivot"): (0.01,)}, steps=0)
+    [named] = friction.setting
+    assert rivals._late(world.candidates, judge, chain, friction, named, anew) == []

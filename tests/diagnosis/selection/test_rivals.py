@@ -37,6 +37,7 @@ def chosen(monkeypatch, fitted, losses):
 
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
+    monkeypatch.setattr(rivals, "_late", lambda *args: [])
     start = Judge().fit({names[fitted]: (2.0,)})
     found, told = rivals.classes([DRY, CURVED], Judge(), None, start, None)
     return [c.name for c in found.setting], {
