@@ -38,6 +38,13 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no floor of a cell's error": {"diagnosis.selection.criterion:SHARE": 0.0},
     "differences must be alike": {"diagnosis.selection.criterion:INDEPENDENT": 0.0},
     "no first look": {"diagnosis.selection.first_look:EACH": 10**6},
+    "no coarse steps": {"diagnosis.simulation.rows:COARSER": 1.0},
+    "whole steps only": {"diagnosis.selection.judge:THIRDS": 1},
+    "any difference on kept-back recordings": {"diagnosis.handover:SCATTER": 0.0},
+    "a force without a name is free": {"diagnosis.estimator:UNNAMED": 0},
+    "no curves in the search": {"diagnosis.selection.identification:CURVES": 0},
+    "fewer starts": {"diagnosis.selection.columns:PROBES": 4},
+    "one finalist": {"diagnosis.selection.identification:FINALISTS": 1},
     "one horizon": {"diagnosis.estimation.ahead:HORIZONS": (1.0,)},
 }
 COLUMNS = (

@@ -20,6 +20,7 @@ TOGETHER = 40  # settings that are simulated in one call
 FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column stands for it
 PROBES = 12  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
+BEGUN = 0.1  # share of an amplitude's scale, at which effects of several values are begun
 STATES = 300  # of the motion, at which forces are compared
 PROMISING = 3  # groups of starts that are simulated
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
@@ -86,7 +87,7 @@ def _usual(candidate, probes, prior):
     """Starts of an effect, their amplitudes as large as the machine's forces let expect."""
     n, rows = candidate.effect.amplitudes, np.array(probes, float)
     if n and len(rows) and np.isfinite(prior.scale[0]) and len(set(rows[:, 0])) == 1:
-        rows[:, :n] *= LADDER[0] * prior.scale[0] / rows[0, 0]
+        rows[:, :n] *= BEGUN * prior.scale[0] / rows[0, 0]
         rows = np.clip(rows, prior.low, prior.high)
     return list(rows)
 
