@@ -182,11 +182,12 @@ def place_of(candidate):
 
 
 def parameters_of(candidate, values, bounds=None):
-    """[parameter] of a finding; a value that the recordings do not show is None, and so is its
-    interval."""
+    """[parameter] of a finding; the interval of a value that the recordings do not show is None, and
+    so is the value where it stays as it was."""
     out = []
     for i, (p, v) in enumerate(zip(candidate.parameters, values)):
-        unseen = bounds is not None and bounds[i] is None
+        untold = bounds is not None and bounds[i] is None
+        unseen = untold and bool(np.isclose(v, p.nominal, rtol=1e-9, atol=0))
         entry = {
             "name": p.name,
             "nominal": float(p.nominal),
@@ -196,7 +197,7 @@ def parameters_of(candidate, values, bounds=None):
         if candidate.effect.name == "unknown":
             entry["at"] = candidate.effect.knots[i]
         if bounds is not None:
-            entry["low"], entry["high"] = (None, None) if unseen else bounds[i]
+            entry["low"], entry["high"] = (None, None) if untold else bounds[i]
         out.append(entry)
     return out
 
