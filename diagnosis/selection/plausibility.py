@@ -195,12 +195,14 @@ def plausible(candidate, usual):
 
 
 def at_limit(candidate, values, prior):
-    """Whether a value lies at a bound of what is plausible: then the truth may lie anywhere
-    beyond."""
+    """Whether a value lies at a bound of what is plausible: then the truth may lie anywhere beyond.
+    At a bound of what is possible (no spring at all, a share of one) nothing lies beyond."""
     values = np.asarray(values, float)
+    ends = np.array([(p.low, p.high) for p in candidate.parameters]).T
     room = 1e-3 * np.minimum(abs(values) + prior.scale, 1e12)
-    ends = (values <= prior.low + room) | (values >= prior.high - room)
-    return bool((ends & (abs(values - prior.centre) > room)).any())
+    low = (values <= prior.low + room) & (prior.low > ends[0])
+    high = (values >= prior.high - room) & (prior.high < ends[1])
+    return bool(((low | high) & (abs(values - prior.centre) > room)).any())
 
 
 def possible(candidate, values, prior):

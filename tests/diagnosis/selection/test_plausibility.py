@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from plants import DRIVEN_PENDULUM, arm, record, recorded
 from scipy import stats
 
-from diagnosis.selection.plausibility import TAIL, Prior, Usual, plausible, possible
+from diagnosis.selection.plausibility import TAIL, Prior, Usual, at_limit, plausible, possible
 from diagnosis.simulation.simulator import World
 
 
@@ -76,3 +76,16 @@ def test_units_are_those_of_the_machine():
         for f in (0.5, 1.0)
     )
     assert two.scale == pytest.approx(2 * one.scale) and two.high == pytest.approx(2 * one.high)
+
+
+def test_only_a_bound_of_what_is_plausible_is_a_limit_beyond_which_the_truth_may_lie(machine):
+    world, usual = machine
+    damping = world.candidate("viscous_damping", world.model.joint(0).name)
+    prior = plausible(damping, usual)
+    assert not at_limit(damping, prior.low, prior)  # none at all: nothing lies beyond
+    assert at_limit(damping, prior.high, prior)
+    assert not at_limit(damping, (prior.low + prior.high) / 2, prior)
+    gain = world.candidate("gain", world.model.actuator(0).name)
+    ends = plausible(gain, usual)
+    assert at_limit(gain, ends.low, ends) and at_limit(gain, ends.high, ends)
+    assert not at_limit(gain, ends.centre, ends)
