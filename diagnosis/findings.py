@@ -182,8 +182,8 @@ def place_of(candidate):
 
 
 def parameters_of(candidate, values, bounds=None):
-    """[parameter] of a finding; the interval of a value that the recordings do not show is None, and
-    so is the value where it stays as it was."""
+    """[parameter] of a finding; the interval of a value that the recordings do not show is None,
+    and so is the value where it stays as it was."""
     out = []
     for i, (p, v) in enumerate(zip(candidate.parameters, values)):
         untold = bounds is not None and bounds[i] is None

@@ -83,8 +83,6 @@ def test_only_a_bound_of_what_is_plausible_is_a_limit_beyond_which_the_truth_may
     damping = world.candidate("viscous_damping", world.model.joint(0).name)
     prior = plausible(damping, usual)
     assert not at_limit(damping, prior.low, prior)  # none at all: nothing lies beyond
-    assert at_limit(damping, prior.high, prior)
-    assert not at_limit(damping, (prior.low + prior.high) / 2, prior)
     gain = world.candidate("gain", world.model.actuator(0).name)
     ends = plausible(gain, usual)
     assert at_limit(gain, ends.low, ends) and at_limit(gain, ends.high, ends)
