@@ -1,49 +1,67 @@
-"""What sensors that are off show of a motion: how far it lies from the motion itself.
+"""What sensors that are off show of a motion, and the motion behind what they show.
 
-q, v = beside(model, setting, recordings, qpos, qvel)     # shown less true, (rows, nv) each
-shown = slopes(model, setting) @ true                     # of small changes (q, v)
+qpos, qvel = shown(model, setting, recordings, qpos, qvel)
+qpos, qvel = behind(model, setting, recordings, qpos, qvel)
 """
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 
-def beside(model, setting, recordings, qpos, qvel):
-    """Shown less true positions and velocities, (rows, nv) in the tangent space, of a motion qpos
-    (rows, nq), qvel (rows, nv) over all recordings: 0 but in hinges and slides whose sensors a
-    setting {Candidate: values} moves, scales or delays."""
-    q, v = np.zeros_like(qvel), np.zeros_like(qvel)
-    ends = np.cumsum([0] + [len(r.time) for r in recordings])
-    for joint, (offset, ratio, delay) in _measures(model, setting):
-        d, true = joint.dofadr[0], qpos[:, joint.qposadr[0]]
-        for recording, a, b in zip(recordings, ends[:-1], ends[1:]):
-            late, speed = _earlier(recording.time, true[a:b], qvel[a:b, d], delay)
-            q[a:b, d] += ratio * late + offset - true[a:b]
-            v[a:b, d] += ratio * speed - qvel[a:b, d]
-    return q, v
+def shown(model, setting, recordings, qpos, qvel):
+    """Positions (rows, nq) and velocities (rows, nv) over all recordings as the sensors of hinges
+    and slides show them under a setting {Candidate: values}: shifted, scaled and late."""
+    show = lambda value, offset, ratio: ratio * value + offset
+    return _each(model, setting, recordings, qpos, qvel, -1.0, show)
 
 
-def slopes(model, setting):
-    """(2 nv, 2 nv): how shown positions and velocities change with the true ones."""
-    out, nv = np.eye(2 * model.nv), model.nv
+def behind(model, setting, recordings, qpos, qvel):
+    """The motion that is shown as qpos, qvel: the inverse of shown(), steady beyond the last row."""
+    true = lambda value, offset, ratio: (value - offset) / ratio
+    return _each(model, setting, recordings, qpos, qvel, 1.0, true)
+
+
+def later(model, setting, recordings, known):
+    """known (rows, nv), NaN where nothing was measured, of the motion behind: NaN too where the
+    recording ends before a late sensor shows it."""
+    known = known.copy()
     for joint, (_, ratio, delay) in _measures(model, setting):
         d = joint.dofadr[0]
-        out[d] *= ratio
-        out[d, nv + d] -= ratio * delay
-        out[nv + d] *= ratio
-    return out
+        for time, rows in _pieces(recordings):
+            value = np.interp(time + delay, time, known[rows, d], right=np.nan)
+            known[rows, d] = value / ratio if delay else known[rows, d] / ratio
+    return known
+
+
+def _each(model, setting, recordings, qpos, qvel, sign, change):
+    """(qpos, qvel) at other times, by a delay before or after, and with other values."""
+    qpos, qvel = qpos.copy(), qvel.copy()
+    for joint, (offset, ratio, delay) in _measures(model, setting):
+        q, d = joint.qposadr[0], joint.dofadr[0]
+        for time, rows in _pieces(recordings):
+            position, speed = qpos[rows, q], qvel[rows, d]
+            if delay and len(time) > 1:
+                position, speed = _at(time, position, speed, time + sign * delay)
+            qpos[rows, q] = change(position, offset, ratio)
+            qvel[rows, d] = change(speed, 0.0, ratio)
+    return qpos, qvel
 
 
 def _measures(model, setting):
     """[(joint, (offset, ratio, delay))] of the effects that move what a joint's sensor shows."""
-    shown = [c for c in setting if c.effect.overrides("measure") and c.place.kind == "joint"]
-    return [(model.joint(c.place.name), c.effect.measure(setting[c])) for c in shown]
+    off = [c for c in setting if c.effect.overrides("measure") and c.place.kind == "joint"]
+    return [(model.joint(c.place.name), c.effect.measure(setting[c])) for c in off]
 
 
-def _earlier(time, position, speed, seconds):
-    """Positions and speeds (rows,) as they were so many seconds before; at rest before the first
-    row."""
-    if not seconds or len(time) < 2:
-        return position, speed
-    then = np.maximum(time - seconds, time[0])
-    return CubicHermiteSpline(time, position, speed)(then), np.interp(then, time, speed)
+def _pieces(recordings):
+    """[(time, slice of rows)] of recordings one after the other."""
+    ends = np.cumsum([0] + [len(r.time) for r in recordings])
+    return [(r.time, slice(a, b)) for r, a, b in zip(recordings, ends[:-1], ends[1:])]
+
+
+def _at(time, position, speed, then):
+    """Positions and speeds (rows,) at other times: at rest before the first row, steady after the
+    last one."""
+    inside = np.clip(then, time[0], time[-1])
+    path = CubicHermiteSpline(time, position, speed)(inside)
+    return path + np.maximum(then - time[-1], 0.0) * speed[-1], np.interp(then, time, speed)

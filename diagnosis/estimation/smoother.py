@@ -19,12 +19,11 @@ from diagnosis.effects.environment import touchable
 from diagnosis.estimation import windowing
 from diagnosis.estimation.kalman import smooth
 from diagnosis.estimation.noise import measurement_noise
-from diagnosis.estimation.readings import beside, slopes
+from diagnosis.estimation.readings import behind, later, shown
 from diagnosis.simulation.rows import RowMap
 
 BLOCK = 200  # rows that are smoothed as one piece
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
-BACK = 2  # turns from what a late sensor shows to the motion: more would amplify noise
 MOST = 10.0  # factor of a variance in one update
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
 
@@ -148,43 +147,38 @@ class Smoother:
             qpos, qvel, force = self.qpos, self.qvel, np.zeros_like(self.qvel)
         else:
             qpos, qvel, force = trajectory.qpos, trajectory.qvel, trajectory.force
-        seen = qpos, qvel
-        for _ in range(BACK):  # from what is shown to what is
-            away = self._shown(setting, qpos, qvel)
-            qpos, qvel = windowing.integrate(self.model, seen[0], -away[0]), seen[1] - away[1]
-        shown = self._shown(setting, qpos, qvel)
-        slope = np.eye(3 * self.model.nv)
-        slope[: 2 * self.model.nv, : 2 * self.model.nv] = slopes(self.model, setting)
-        back = np.linalg.inv(slope)
+        off = self.model, setting, self.recordings
+        qpos, qvel = behind(*off, qpos, qvel)
+        seen = self._seen(off)
         for _ in range(passes):
             free = self._touching(qpos)
-            A, c, *rest = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
-            step = slope @ A @ back, c @ slope.T, *rest  # of what is shown
+            step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
             for _ in range(UPDATES):
-                found = self._smooth(step, qpos, qvel, shown)
+                found = self._smooth(step, qpos, qvel, seen)
                 self._update(found)
-            found = self._smooth(step, qpos, qvel, shown)
+            found = self._smooth(step, qpos, qvel, seen)
             nv, live = self.model.nv, self.live
             state, deviation = (np.empty((len(qpos), 3 * nv)) for _ in range(2))
             state[self.index[live]], deviation[self.index[live]] = (
                 found.state[live],
                 np.sqrt(found.variance[live]),
             )
-            state = state @ back.T
             qpos = windowing.integrate(self.model, qpos, state[:, :nv])
             qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
-            shown = self._shown(setting, qpos, qvel)
-        qpos, qvel = windowing.integrate(self.model, qpos, shown[0]), qvel + shown[1]
+        qpos, qvel = shown(*off, qpos, qvel)
         self.position_noise, self.velocity_noise = self._noise()
         sd = np.split(deviation, 3, axis=1)
         transition = np.tile(np.eye(2 * nv, 3 * nv), (len(qpos), 1, 1))
-        transition[~self.last] = A[:, : 2 * nv]
+        transition[~self.last] = step[0][:, : 2 * nv]
         split = np.split(transition, [2 * nv], axis=2)
         args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
         return Trajectory(*args)
 
-    def _shown(self, setting, qpos, qvel):
-        return beside(self.model, setting, self.recordings, qpos, qvel)
+    def _seen(self, off):
+        """(qpos, qvel, and both as far as they were measured, NaN elsewhere) of the motion behind
+        what the recordings show."""
+        qpos, qvel = behind(*off, self.qpos, self.qvel)
+        return qpos, qvel, later(*off, self.position), later(*off, self.velocity)
 
     def _touching(self, qpos):
         """Rows (N,) at or after which something touches; a force there is told by no smooth map."""
@@ -232,7 +226,7 @@ class Smoother:
         whole[:, 2 * nv :, 2 * nv :] = np.eye(nv)
         return whole, np.concatenate([drift, np.zeros((n, nv))], 1), extra, rows.seconds
 
-    def _smooth(self, step, qpos, qvel, shown):
+    def _smooth(self, step, qpos, qvel, seen):
         A, c, extra, seconds = step
         nv, (T, b) = self.model.nv, self.index.shape
         follows = self.live & ~self.last[self.index]
@@ -245,10 +239,10 @@ class Smoother:
         noise[..., nv : 2 * nv] = extra[at]
         noise[..., 2 * nv :] = self.walk * seconds[at][..., None]
         noise[~follows] = 0.0
-        gap = windowing.difference(self.model, qpos, self.qpos) - shown[0]
-        velocity = self.velocity - qvel - shown[1]
-        offset = np.concatenate([gap, self.qvel - qvel - shown[1]], 1)
-        y = np.concatenate([gap + self.position, velocity], 1)
+        seen_qpos, seen_qvel, position, velocity = seen
+        gap = windowing.difference(self.model, qpos, seen_qpos)
+        offset = np.concatenate([gap, seen_qvel - qvel], 1)
+        y = np.concatenate([gap + position, velocity - qvel], 1)
         y = np.where(self.live[..., None], y[self.index], np.nan)
         first = self.index[0]
         start = np.concatenate([offset[first], np.zeros((b, nv))], 1)

@@ -173,6 +173,7 @@ def shown(offset, ratio, late, rows=300):
     "name, value, off",
     [
         ("sensor_delay", 0.015, (0.0, 1.0, 3)),
+        ("sensor_delay", 0.04, (0.0, 1.0, 8)),
         ("sensor_bias", 0.3, (0.3, 1.0, 0)),
         ("sensor_scale", 1.3, (0.0, 1.3, 0)),
     ],

@@ -123,6 +123,27 @@ def test_what_is_no_equal_is_not_told():
     assert told[friction] == []
 
 
+@pytest.mark.parametrize(
+    "losses, taken",
+    [
+        ((-1.0, -0.5, -0.2), 1),  # the whole step
+        ((-1.0, -2.0, -1.5), 1 / 3),  # a third, which is better
+        ((3.0, -0.5, -0.7), 1 / 9),  # the whole step is worse than none
+        ((3.0, 2.0, 1.0), None),
+        ((-1e-4, 1.0, 1.0), None),  # not worth a step
+    ],
+)
+def test_a_step_is_taken_as_far_as_it_lowers_the_loss(monkeypatch, losses, taken):
+    shares = dict(zip((1.0, 1 / 3, 1 / 9), losses))
+    judge = object.__new__(Judge)
+    judge.ahead = SimpleNamespace(residual=lambda settings: settings)
+    judge.cost = lambda share: 0.0
+    judge._whole = lambda residual, setting, evidence: shares.get(residual, 0.0)
+    monkeypatch.setattr("diagnosis.selection.judge.moved_setting", lambda columns, share: share)
+    found = judge._lower(SimpleNamespace(residual=0.0), None, 1.0, 0.0)
+    assert (found and found[0]) == taken
+
+
 def test_a_late_sensor_is_told_beside_a_late_drive_each_from_its_own_start_states():
     judge = judge_of()
     world, asked = judge.ahead.world, []

@@ -81,8 +81,9 @@ def test_units_are_those_of_the_machine():
 def test_only_a_bound_of_what_is_plausible_is_a_limit_beyond_which_the_truth_may_lie(machine):
     world, usual = machine
     damping = world.candidate("viscous_damping", world.model.joint(0).name)
-    prior = plausible(damping, usual)
-    assert not at_limit(damping, prior.low, prior)  # none at all: nothing lies beyond
+    prior = Prior(*(np.array([x]) for x in (3.0, 1.0, 0.0, 8.0)))
+    assert not at_limit(damping, (0.0,), prior)  # none at all: nothing lies beyond
+    assert at_limit(damping, (8.0,), prior) and not at_limit(damping, (4.0,), prior)
     gain = world.candidate("gain", world.model.actuator(0).name)
     ends = plausible(gain, usual)
     assert at_limit(gain, ends.low, ends) and at_limit(gain, ends.high, ends)
