@@ -16,7 +16,7 @@ def shown(model, setting, recordings, qpos, qvel):
 
 
 def behind(model, setting, recordings, qpos, qvel):
-    """The motion that is shown as qpos, qvel: the inverse of shown(), steady beyond the last row."""
+    """The motion that is shown as qpos, qvel: shown() turned back, steady beyond the last row."""
     true = lambda value, offset, ratio: (value - offset) / ratio
     return _each(model, setting, recordings, qpos, qvel, 1.0, true)
 
