@@ -37,7 +37,9 @@ def classes(candidates, judge, chain, fitted, anew, log=lambda what: None):
             swapped = True
         tied = [(f, o) for f, o in members if f.score.loss < fitted.score.loss + TIED]
         others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
-        others[own] += _late(candidates, judge, chain, fitted, own, anew)
+        told = {o for o, _ in others[own]}
+        pool = [c for c in candidates if c not in told and c not in fitted.setting]
+        others[own] += _late(pool, judge, chain, fitted, own, anew)
     others = {c: each[:MOST] for c, each in others.items() if c in fitted.setting}
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
@@ -57,18 +59,20 @@ def _members(candidates, judge, chain, fitted, candidate):
     return sorted(out, key=lambda pair: pair[0].loss)
 
 
-def _late(candidates, judge, chain, fitted, candidate, anew):
+def _late(pool, judge, chain, fitted, candidate, anew):
     """[(other, values)] of a delay in the drive for one in the sensor, or the other way round, that
     predict as well: both begin at states of their own, for a late sensor shows others."""
-    late = lambda c: c.effect.overrides("measure") and c.effect.measure((1.0,) * 3)[2] > 0
     world = chain.world
-    pool = [c for c in world.related(candidate) if c in candidates and c not in fitted.setting]
-    pool = [c for c in pool if late(c) != late(candidate) and world.joints(c.place)]
-    if not pool or not world.joints(candidate.place):
+    late = lambda c: (
+        c.effect.overrides("measure") and c.effect.measure(np.ones(len(c.parameters)))[2] > 0
+    )
+    near = [c for c in world.related(candidate) if c in pool and late(c) != late(candidate)]
+    near = [c for c in near if world.joints(c.place)]
+    if not near or not world.joints(candidate.place):
         return []
+    rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     least, out = anew(judge, fitted)[0].score.loss + TIED, []
-    for other in pool:
-        rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
+    for other in near:
         tried = judge.fit({**rest, other: fitted.setting[candidate]}, steps=0)
         tried = anew(judge, tried)[0]
         if tried.settled and tried.score.loss < least:
