@@ -91,7 +91,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
 
 
 def _checked(search, found, fitted, others, log):
-    """The Outcome so far: curves tried beside the names, what is left, p-values."""
+    """The Outcome so far: curves tried beside the names, and what is left."""
     world, train, judge = search.world, search.train, found.judge
     dependences = unmodelled_force.dependences(world, found.first, train)
     trajectory, adequacy = found.trajectory, {}

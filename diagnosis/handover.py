@@ -100,7 +100,7 @@ class Check:
         """Squared error, in noises, by which noise alone makes one prediction better than another:
         SCATTER standard deviations of the mean square of what is measured, as far as its noise is
         told."""
-        known = windowing.known(self.world.model, self.windows)
+        known = windowing.known(self.world.model, self.windows)[:, 1:]
         return SCATTER * np.sqrt(2 * known[..., self.told].sum()) / max(known.sum(), 1)
 
     def error(self, files, windows=None):
@@ -119,7 +119,7 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
     are told."""
     nominal = Files.of(world, {})
     windows = check.smoothed()
-    before = check.error(nominal, windows)
+    before, nothing = check.error(nominal, windows), check.scattered()
     while True:
         files = Files.of(world, setting)
         after = check.error(files, windows)
@@ -130,7 +130,7 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
         without = {out: check.error(rest, windows) for out, rest in less.items()}
         held = [c for c in setting if files.forms[c] in ("mjcf", "python")]
         worst = min(held, key=lambda c: without[c], default=None)
-        least = after**2 - check.scattered()
+        least = after**2 - nothing
         if worst is None or least < min(without[worst], before) ** 2:
             errors = {out: (told or check).error(rest) for out, rest in less.items()}
             return Handed(setting, files, nominal, errors)

@@ -38,7 +38,7 @@ class Ahead:
     def __init__(self, world, windows, noise):
         self.world, self.model, self.windows = world, world.model, windows
         self.measured = windowing.measured(windows)
-        self.known = np.isfinite(windowing.difference(self.model, self.measured, self.measured))
+        self.known = windowing.known(self.model, windows)
         self.known[:, 0] = False
         count = self.measured.shape[1]
         ahead = np.full((len(windows), count), np.nan)

@@ -72,9 +72,7 @@ def floor_gaps(world, settings, smoother, trajectory, horizon=windowing.HORIZON)
     seconds = np.array(
         [w.recording.time[w.first + 1] - w.recording.time[e.first] for w, e in zip(windows, early)]
     )
-    known = np.isfinite(
-        windowing.difference(model, windowing.measured(windows), windowing.measured(windows))
-    )
+    known = windowing.known(model, windows)
     measured = np.array([np.isfinite(w.recording.qvel[w.first]) for w in windows])
     spread, out = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0), []
     for _ in range(DRAWS):
@@ -111,8 +109,7 @@ def curve(world, settings, smoother, trajectory, noise, longest=3 * windowing.HO
     seconds = [w.recording.time[w.first : w.last + 1] - w.recording.time[w.first] for w in windows]
     sample = np.median([s[-1] / (len(s) - 1) for s in seconds])
     most = max(1, round(max(s[-1] for s in seconds) / sample))
-    measured = windowing.measured(windows)
-    known = np.isfinite(windowing.difference(world.model, measured, measured))
+    known = windowing.known(world.model, windows)
     predicted = {
         name: predict(world, s, windows)[0] for name, s in (("before", {}), ("after", settings))
     }

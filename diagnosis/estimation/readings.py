@@ -28,8 +28,9 @@ def later(model, setting, recordings, known):
     for joint, (_, ratio, delay) in _measures(model, setting):
         d = joint.dofadr[0]
         for time, rows in _pieces(recordings):
-            value = np.interp(time + delay, time, known[rows, d], right=np.nan)
-            known[rows, d] = value / ratio if delay else known[rows, d] / ratio
+            if delay:
+                known[rows, d] = np.interp(time + delay, time, known[rows, d], right=np.nan)
+            known[rows, d] /= ratio
     return known
 
 

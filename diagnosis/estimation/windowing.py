@@ -126,8 +126,8 @@ def position_residual(model, windows, qpos):
 
 
 def known(model, windows):
-    """Whether something was measured in the rows after the first of windows, (W, T - 1, nv)."""
-    rows = measured(windows)[:, 1:]
+    """Whether something was measured in the rows of windows, (W, T, nv)."""
+    rows = measured(windows)
     return np.isfinite(difference(model, rows, rows))
 
 
@@ -137,7 +137,8 @@ def gaps(model, windows, qpos):
 
     Row 0 of a window is the start and does not count. A prediction that blew up counts as infinite.
     """
-    residual, there = position_residual(model, windows, qpos)[:, 1:], known(model, windows)
+    residual = position_residual(model, windows, qpos)[:, 1:]
+    there = known(model, windows)[:, 1:]
     return np.where(there, np.where(abs(residual) < ENDLESS, residual, np.inf), 0.0), there
 
 

@@ -83,7 +83,7 @@ def applied(model, qpos, qvel, working):
     return out
 
 
-def _usual(candidate, probes, prior):
+def _begun(candidate, probes, prior):
     """Starts of an effect, their amplitudes as large as the machine's forces let expect."""
     n, rows = candidate.effect.amplitudes, np.array(probes, float)
     if n and len(rows) and np.isfinite(prior.scale[0]) and len(set(rows[:, 0])) == 1:
@@ -132,7 +132,7 @@ class Columns:
                 return out
             whole = list(world.far(candidate, recordings)) + self._ladder(base, prior)
         else:
-            out, whole = [], _usual(candidate, world.probes(candidate, recordings), prior)
+            out, whole = [], _begun(candidate, world.probes(candidate, recordings), prior)
         together = candidate.effect.together
         if together == 1 and len(whole) > PROBES:
             some = np.unique(np.linspace(0, len(whole) - 1, PROBES).astype(int))

@@ -74,14 +74,15 @@ class Identification:
                 break
             setting = fitted.setting
             trajectory = smoother.locate(setting, trajectory, passes=1)
-        self.ahead.start(trajectory)
-        self.screen.start(trajectory, setting)
+        else:  # rounds ended with a set from which nothing has begun
+            self.ahead.start(trajectory)
+            self.screen.start(trajectory, setting)
         judge = Judge(self.ahead, self.usual, seen=self.seen)
         fitted = judge.fit(setting)
         return Found(fitted, trajectory, first, smoother, self.usual, judge, self.screen, ranking)
 
     def _round(self, setting):
-        """(Fitted, whether it is better than what there was, first ranking)."""
+        """(Fitted, whether it holds other effects than there were, first ranking)."""
         candidates = [c for c in self.candidates if c not in self.idle and c not in setting]
         every, curves = [*setting, *candidates], self._curves(setting)
         columns = Columns(

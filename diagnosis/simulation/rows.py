@@ -17,17 +17,16 @@ from diagnosis.simulation.simulator import Case
 INPUT = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 CHUNK = 40000  # simulations in memory at a time
 STEPS, COARSER = 2, 4.0  # coarse ones in a row, no longer than so many of the simulator's
-SWING = 0.3  # rad that the stiffest servo or spring swings in one, or its damper's share
+SWING = 0.3  # rad of phase, or share of the decay, of the fastest joint's motion in a coarse step
 SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per second, of the force
 
 
 def coarse(world, recordings):
     """{time_step: seconds}: a few steps in a row, for what is a difference of two simulations."""
-    [step] = [c for c in world.candidates if c.effect.name == "time_step"]
     own = world.model.opt.timestep
     seconds = np.median(np.concatenate([np.diff(r.time) for r in recordings])) / STEPS
     seconds = min(seconds, COARSER * own, SWING / max(_fastest(world.model), 1e-9))
-    return {step: (float(max(seconds, own)),)}
+    return {world.candidate("time_step", "world"): (float(max(seconds, own)),)}
 
 
 def _fastest(model):
