@@ -74,7 +74,7 @@ class Check:
         self.world, self.recordings, self.smoother = world, recordings, smoother
         self.windows = prediction_error.consecutive(recordings, windowing.HORIZON)
         self.noise, self.told = prediction_error.reporting_noise(noise), np.isfinite(noise)
-        self.trajectory, self.scatter = None, 0.0
+        self.trajectory, self.scatter, self.path = None, 0.0, None
 
     def locate(self, setting):
         """Smooth the recordings under a setting, for the floor."""
@@ -87,10 +87,12 @@ class Check:
         predicted = files.predicted(model, windows or self.windows)
         return windowing.error(model, self.windows, predicted, self.noise)
 
-    def smoothed(self):
-        """The windows, begun at the motion that is located under the nominal model: noise of start
-        states as recorded moves a prediction by more than many an effect does."""
-        path, begun = copy(self.smoother).locate({}), {}
+    def smoothed(self, setting):
+        """The windows, begun at the motion that is located under a setting: noise of start states
+        as recorded moves a prediction by more than many an effect does, and so do those that
+        another setting located."""
+        self.path = copy(self.smoother).locate(setting, self.path, passes=1 if self.path else 3)
+        path, begun = self.path, {}
         for r in self.recordings:
             rows = path.rows(r)
             begun[r] = replace(r, qpos=path.qpos[rows], qvel=path.qvel[rows])
@@ -103,6 +105,11 @@ class Check:
         known = windowing.known(self.world.model, self.windows)[:, 1:]
         return SCATTER * np.sqrt(2 * known[..., self.told].sum()) / max(known.sum(), 1)
 
+    def squares(self, files, setting):
+        """Squared errors of the Files of a setting (2,): from start states as recorded, and as they
+        are smoothed under it."""
+        return np.array([self.error(files, w) for w in (self.windows, self.smoothed(setting))]) ** 2
+
     def error(self, files, windows=None):
         """As errors(), of all channels; infinite where they do not run."""
         try:
@@ -112,27 +119,32 @@ class Check:
 
 
 def accepted(world, check, setting, refit=lambda some, out: some, log=lambda what: None, told=None):
-    """The Handed of what of a setting kept-back recordings do not speak against, from smoothed
-    start states: neither all of it nor any finding makes a prediction worse by more than noise
-    does. Where these recordings do not show a finding, those that it was found on have decided.
-    refit(setting, out): what is left without one, fitted again; told: the Check of the errors that
-    are told."""
+    """The Handed of what of a setting kept-back recordings do not speak against: neither all of it
+    nor any finding makes a prediction worse by more than noise does, from start states as recorded
+    and as smoothed too. Where these recordings do not show a finding, those that it was found on
+    have decided. refit(setting, out): what is left without one, fitted again; told: the Check of
+    the errors that are told."""
     nominal = Files.of(world, {})
-    windows = check.smoothed()
-    before, nothing = check.error(nominal, windows), check.scattered()
+    before, nothing = check.squares(nominal, {}), check.scattered()
     while True:
         files = Files.of(world, setting)
-        after = check.error(files, windows)
-        less = {
-            out: Files.of(world, {c: v for c, v in setting.items() if c is not out})
-            for out in setting
+        after = check.squares(files, setting)
+        rest = {o: {c: v for c, v in setting.items() if c is not o} for o in setting}
+        less = {out: Files.of(world, others) for out, others in rest.items()}
+        worse = {
+            c: _worse(after, check.squares(less[c], rest[c]))
+            for c in setting
+            if files.forms[c] in ("mjcf", "python")
         }
-        without = {out: check.error(rest, windows) for out, rest in less.items()}
-        held = [c for c in setting if files.forms[c] in ("mjcf", "python")]
-        worst = min(held, key=lambda c: without[c], default=None)
-        least = after**2 - nothing
-        if worst is None or least < min(without[worst], before) ** 2:
-            errors = {out: (told or check).error(rest) for out, rest in less.items()}
+        worst = max(worse, key=worse.get, default=None)
+        if worst is None or max(worse[worst], _worse(after, before)) < nothing:
+            errors = {out: (told or check).error(without) for out, without in less.items()}
             return Handed(setting, files, nominal, errors)
-        log(f"  not handed over: {worst}: {without[worst]:.4g} without, {after:.4g} with")
-        setting = refit({c: v for c, v in setting.items() if c is not worst}, worst)
+        log(f"  not handed over: {worst}: worse by {worse[worst]:.4g}, noise {nothing:.4g}")
+        setting = refit(rest[worst], worst)
+
+
+def _worse(squares, others):
+    """By how much squared errors (kinds,) are larger than others, at least; infinity is worse."""
+    both = np.isinf(squares) & np.isinf(others)
+    return float(np.min(np.where(both, 0.0, squares - np.where(both, 0.0, others))))

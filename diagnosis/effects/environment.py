@@ -98,11 +98,11 @@ class TimeStep(Effect):
     def parameters(self, model, i):
         h = model.opt.timestep
         return (
-            Parameter("seconds", "s", h, h / 4, h, -h / 2),
-        )  # a quarter leaves a quarter of the error; finer is dear
+            Parameter("seconds", "s", h, h / 2, h, -h / 4),
+        )  # a half leaves half of the error, and tells that there is one; finer is dear
 
     def probes(self, model, i, recordings):
-        return model.opt.timestep / np.array([[2.0], [4.0]])
+        return model.opt.timestep / np.array([[2.0]])
 
     def edit(self, model, i, values):
         model.opt.timestep = values[0]

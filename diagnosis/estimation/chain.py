@@ -38,9 +38,9 @@ class Chain(Ahead):
         beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
         self.beside = np.where(self.known, beside, 0.0)
         # columns are differences: what a coarse step does wrong it does with an effect and without
-        self.coarse, base = coarse(self.world, trajectory.first), self.plain(setting or {})
-        rough = self._rows({**self.coarse, **base}, self.begin)
-        self.finer = self._rows(base, self.begin) - rough
+        self.coarse, self.base = coarse(self.world, trajectory.first), self.plain(setting or {})
+        rough = self._rows({**self.coarse, **self.base}, self.begin)
+        self.finer, self.beyond = self._rows(self.base, self.begin) - rough, {}
         self.whole = self._begun(self.windows)
         self.contacts = self._begun([self.windows[i] for i in self.touched])
         self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
@@ -75,15 +75,18 @@ class Chain(Ahead):
             row[:] = done[key]
 
     def _beyond(self, settings, plain, out):
-        """Add what effects do that are more than what happens within a row."""
-        more = [k for k, s in enumerate(settings) if len(plain[k]) < len(s)]
-        if not more:
-            return
-        bare = {frozenset(plain[k].items()): plain[k] for k in more}
-        without = dict(zip(bare, self.whole.residual(list(bare.values()))))
-        both = self.whole.residual([settings[k] for k in more])
-        for k, gap in zip(more, both):
-            out[k] += gap - without[frozenset(plain[k].items())]
+        """Add what effects do that are more than what happens within a row, beside the setting that
+        located the motion: what else a setting holds hardly changes that."""
+        more = [{c: v for c, v in s.items() if c not in p} for s, p in zip(settings, plain)]
+        new = {frozenset(m.items()): m for m in more if m}
+        new = {key: m for key, m in new.items() if key not in self.beyond}
+        if new:
+            every = [self.base, *({**self.base, **m} for m in new.values())]
+            first, *rest = self.whole.residual(every)
+            self.beyond |= {key: both - first for key, both in zip(new, rest)}
+        for row, m in zip(out, more):
+            if m:
+                row += self.beyond[frozenset(m.items())]
 
     def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""

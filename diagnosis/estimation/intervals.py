@@ -55,8 +55,8 @@ def without_step(fitted, index):
     change = columns.residual - columns.ahead.residual([fitted.setting], refine=2)[0]
     change = np.where(columns.lost, 0.0, change)
     stack = np.concatenate([columns.array[..., index[1:] - 1], change[..., None]], -1)
-    kind = type(fitted.evidence)  # of a floor above this one
-    evidence = kind(columns.ahead, columns.residual, stack, fitted.evidence.floor)
+    kind = type(fitted.evidence)  # of a layer above this one
+    evidence = kind(columns.ahead, columns.residual, stack)
     every = np.arange(p + 2)
     wide, amounts = half_widths(evidence, every)
     weight = evidence.weight(every, np.zeros(p + 1))

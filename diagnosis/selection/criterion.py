@@ -9,7 +9,8 @@ gain = paired(score, other)
 A hypothesis predicts residual - columns @ amounts. Its error counts per cell: a channel (a joint, a
 free joint's position or rotation) in a band of time ahead, in a group of windows. The loss is the
 sum over channels of the mean over bands and groups of log RMS, each group predicted with the
-others' amounts.
+others' amounts, above that of a reference. What is within the noise under both tells nothing of
+either: groups count by how far the larger error exceeds it.
 """
 
 from dataclasses import dataclass
@@ -18,25 +19,29 @@ import numpy as np
 
 from diagnosis.common.distributions import t_sf
 
-# of a cell's median error over groups, that counts as none: one still window decides nothing
-SHARE = 0.1
 NOISE = 0.3  # of the noise, that counts as none
-GROSS = 5.0  # a window's error over the median, from which on it counts no more
+BEYOND = 1.5  # of the noise, from which on an error counts
 ITERATIONS = 3  # of reweighted least squares
-INDEPENDENT = 1.0  # errors of a cell, as which it counts where a few groups decide
+INDEPENDENT = 2.0  # errors of a cell, as which it counts where a few groups decide
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
 PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
 
 
 @dataclass(frozen=True)
 class Score:
-    """loss: sum over channels of mean log RMS; groups (G,): the same of each group; amounts (p,):
-    fitted to all; cells: of a channel in a group."""
+    """loss: sum over channels of mean log RMS above the reference's; groups (G,): the part of each
+    group, of which that is the mean; nats (G,): their logs summed; amounts (p,): fitted to all."""
 
     loss: float
     groups: np.ndarray
+    nats: np.ndarray
     amounts: np.ndarray
-    cells: float
+
+    def plus(self, prior, number):
+        """With the cost of a prior, nats, of so many independent errors."""
+        cost = prior / number
+        nats = self.nats + prior / len(self.nats)
+        return Score(self.loss + cost, self.groups + cost, nats, self.amounts)
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,8 @@ def paired(before, after):
         return Comparison(gain, 1.0)
     spread = np.std(d, ddof=1) / np.sqrt(n)
     alike = t_sf(d.mean() / spread, n - 1) if spread > 0 else 1.0
-    nats = INDEPENDENT * (d.sum() - d.max()) * before.cells
+    each = before.nats - after.nats
+    nats = INDEPENDENT * (each.sum() - each.max())
     return Comparison(gain, float(min(alike, np.exp(-max(nats, 0.0)))))
 
 
@@ -75,41 +81,34 @@ class Evidence:
     hypothesis needs."""
 
     def __init__(self, ahead, residual, columns, reference=None):
-        """reference (G, cells): floors of the squared error; None makes them of this residual."""
+        """reference (G, cells): mean squared errors of what others are compared with; None takes
+        this residual's."""
         groups, bands = ahead.group.max() + 1, range(ahead.band.max() + 1)
         stack = np.concatenate([residual[..., None], columns], -1)
         cells = [(dofs, b) for dofs in ahead.channels for b in bands]
         self.count = np.zeros((groups, len(cells)))
         self.channels = len(ahead.channels)
-        least, rows = np.zeros(len(cells)), {}
+        self.noise, rows = np.zeros(len(cells)), {}
         for j, (dofs, b) in enumerate(cells):
             inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
-            noise = np.where(np.isfinite(ahead.noise[dofs]), ahead.noise[dofs], 0.0)
-            least[j] = (NOISE**2) * np.mean(noise**2)
-            weight = _weights(residual[..., dofs], inside)
+            finite = np.isfinite(ahead.noise[dofs])
+            self.noise[j] = np.sqrt(np.mean(np.where(finite, ahead.noise[dofs], 0.0) ** 2))
             for g in range(groups):
                 w = np.flatnonzero((ahead.group == g) & inside.any((1, 2)))
-                if not len(w):
-                    continue
-                part, here = stack[w][:, :, dofs], inside[w]
-                root = np.repeat(np.sqrt(weight[w]), here.sum((1, 2)))
-                rows[g, j] = part[here] * root[:, None]
-                self.count[g, j] = len(root)
+                if len(w):
+                    rows[g, j] = stack[w][:, :, dofs][inside[w]]
+                    self.count[g, j] = len(rows[g, j])
         self._keep(rows, stack.shape[-1])
+        self.floor = (NOISE * self.noise) ** 2 + 1e-30
         square = self.own[:, :, 0] / np.maximum(self.count, 1)
-        self.floor = reference
-        if reference is None:
-            middle = [
-                np.median(s[c > 0]) if (c > 0).any() else 0.0
-                for s, c in zip(square.T, self.count.T)
-            ]
-            self.floor = np.tile(least + SHARE**2 * np.array(middle) + 1e-30, (groups, 1))
+        self.reference = square if reference is None else reference
         seen = (self.count > 0).any(0).sum()
         self.cells = max(seen / max(self.channels, 1), 1 / groups)  # of a channel in a group
-        self.number = self.cells * groups
+        counting = self._counting(self.reference).sum() / max(seen, 1)
+        self.number = self.cells * max(counting, 1.0)
 
     def _keep(self, rows, width):
-        """Keep weighted rows {(group, cell): (n, width)}, columns first, and their squares.
+        """Keep rows {(group, cell): (n, width)}, columns first, and their squares.
 
         Products of all columns with all would take the square of their number: those asked for are
         worked out when they are.
@@ -149,10 +148,24 @@ class Evidence:
         square = np.einsum("gi,gcij,gj->gc", z, g, z, optimize=PAIRS)
         return np.maximum(square, 0.0) / np.maximum(self.count, 1)
 
-    def losses(self, square):
-        """Loss of every group (G,) from mean squared errors (G, cells)."""
+    def _counting(self, square):
+        """How much cells of mean squared errors (G, cells) count, 0 to 1: by their excess."""
+        least = (BEYOND * self.noise) ** 2
+        return np.where(self.count > 0, 1 - least / np.maximum(square, least + 1e-30), 0.0)
+
+    def _scored(self, square, amounts):
+        """The Score of mean squared errors (G, cells)."""
+        log = 0.5 * np.log((square + self.floor) / (self.reference + self.floor))
+        counting = self._counting(np.maximum(square, self.reference))
+        each = counting * log
+        groups = len(each) * (each / np.maximum(counting.sum(0), 1.0)).sum(1) / self.cells
+        return Score(float(groups.mean()), groups, each.sum(1), amounts)
+
+    def plain(self):
+        """Mean log RMS over all groups, counted alike, summed over channels: what a fit lowers."""
+        square = self.own[:, :, 0] / np.maximum(self.count, 1)
         log = np.where(self.count > 0, 0.5 * np.log(square + self.floor), 0.0)
-        return log.sum(1) / np.maximum((self.count > 0).sum(1), 1) * self.channels
+        return float(log.sum() / max((self.count > 0).sum(), 1) * self.channels)
 
     def score(self, columns, low, high, precision, pull):
         """Score of a hypothesis.
@@ -163,8 +176,7 @@ class Evidence:
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
         p, amounts, g = len(index) - 1, np.zeros(len(index) - 1), self.products(index)
         if not p:
-            groups = self.losses(self._square(g, amounts))
-            return Score(float(groups.mean()), groups, amounts, self.cells)
+            return self._scored(self._square(g, amounts), amounts)
         for _ in range(ITERATIONS):
             each = np.einsum("gc,gcij->gij", self._weight(g, amounts), g)
             whole = each.sum(0)
@@ -172,8 +184,7 @@ class Evidence:
         each = np.einsum("gc,gcij->gij", self._weight(g, amounts), g)
         rest = each.sum(0) - each
         left = each_bounded(rest[:, 1:, 1:] + np.diag(precision), rest[:, 1:, 0] + pull, low, high)
-        groups = self.losses(self._square(g, left))
-        return Score(float(groups.mean()), groups, amounts, self.cells)
+        return self._scored(self._square(g, left), amounts)
 
     def weight(self, index, amounts):
         """(G, cells): weights of squares at which least squares lowers the sum of logs."""
@@ -201,18 +212,6 @@ class Evidence:
             curve -= (cross * np.linalg.solve(inside, cross.T).T).sum(1)
         seen = curve > 1e-9 * np.maximum(own, 1e-300)
         return np.where(seen, score**2 / np.where(seen, curve, 1.0) / 2, 0.0)
-
-
-def _weights(residual, inside):
-    """(W,): less than one for windows whose error is gross beside the others'."""
-    square = np.where(inside, residual**2, 0.0).sum((1, 2)) / np.maximum(inside.sum((1, 2)), 1)
-    some = square[inside.any((1, 2))]
-    usual = np.median(some) if len(some) else 0.0
-    return (
-        np.minimum(1.0, GROSS**2 * usual / np.maximum(square, 1e-300))
-        if usual
-        else np.ones(len(square))
-    )
 
 
 def each_bounded(matrices, vectors, low, high):

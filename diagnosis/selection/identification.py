@@ -7,6 +7,8 @@ found.fitted.setting; found.trajectory
 from copy import copy
 from dataclasses import dataclass
 
+import numpy as np
+
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
@@ -20,7 +22,6 @@ from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
-IDLE = 1.0  # nats that an effect must promise beside those chosen, to be looked at once more
 STAYS = 0.025  # loss that other start states still remove, from which on they stay
 ANEW = 4  # times that a set is fitted to start states of its own, at most
 CURVES = 4  # that compete in a round, of those that a located force follows best
@@ -49,7 +50,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen, self.idle = {}, set()
+        self.seen = {}
         self.candidates = [
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
         ]
@@ -77,41 +78,46 @@ class Identification:
         else:  # rounds ended with a set from which nothing has begun
             self.ahead.start(trajectory)
             self.screen.start(trajectory, setting)
-        judge = Judge(self.ahead, self.usual, seen=self.seen)
+        judge = self.judge()
         fitted = judge.fit(setting)
         return Found(fitted, trajectory, first, smoother, self.usual, judge, self.screen, ranking)
 
+    def judge(self):
+        """A Judge that compares with the nominal model: an effect has to remove something of what
+        that misses."""
+        return Judge(self.ahead, self.usual, squares(self.ahead), self.seen)
+
     def _round(self, setting):
         """(Fitted, whether it holds other effects than there were, first ranking)."""
-        candidates = [c for c in self.candidates if c not in self.idle and c not in setting]
-        every, curves = [*setting, *candidates], self._curves(setting)
+        others = [c for c in self.candidates if c not in setting]
+        every, curves = [*setting, *others], self._curves(setting)
         columns = Columns(
             self.screen, setting, self.usual, every, seen=self.seen, few=True, curves=curves
         )
-        evidence = Evidence(self.screen, columns.residual, columns.array)
-        columns.secants(evidence)
-        evidence = Evidence(self.screen, columns.residual, columns.array, evidence.floor)
+        nominal = squares(self.screen, columns.residual if not setting else None)
+        columns.secants(Evidence(self.screen, columns.residual, columns.array, nominal))
+        evidence = Evidence(self.screen, columns.residual, columns.array, nominal)
         beam = Beam(columns, evidence)
         start, nodes = beam.nodes()
         self.log(
             f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}"
         )
-        judge = Judge(self.ahead, self.usual, seen=self.seen)
+        judge = self.judge()
         now = judge.fit(setting)
-        judge.reference = now.evidence.floor
         now, by = self.begun_anew(judge, now) if setting else (now, judge)
         judged = {now: by}
         number = len(every) + len(curves)
         for node in self._finalists(beam, start, nodes, number):
             fitted, by = self.begun_anew(judge, judge.fit(beam.setting(node), steps=3))
-            self.log(f"  linear {node.loss:.3f} judged {fitted.loss:.3f} {said(fitted.setting)}")
+            p = paired(now.score, fitted.score).p_value
+            losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
+            self.log(f"  {losses} {'' if fitted.settled else '(limit) '}{said(fitted.setting)}")
             judged[fitted] = by
         best = self._choose(list(judged), now, number)
         if best is not now:
             judge = judged[best]
             best = self.pruned(judge, judge.fit(best.setting))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
-            self._set_aside(beam, columns, best)
         better = best.setting.keys() != setting.keys()
         return best, better, [] if setting else self._ranking(beam, start, nodes)
 
@@ -137,15 +143,6 @@ class Identification:
             if k and fitted.loss > before.loss - STAYS:
                 break
         return fitted, again
-
-    def _set_aside(self, beam, columns, chosen):
-        """Leave out of further rounds what would have added nothing beside the chosen effects."""
-        last = {o.candidate: k for k, o in enumerate(columns.options)}
-        node = beam.node([last[c] for c in chosen.setting if c in last])
-        most = {}  # of what was looked at beside them
-        for option, gain in zip(columns.options, beam.gains(node)):
-            most[option.candidate] = max(most.get(option.candidate, 0.0), gain)
-        self.idle |= {c for c, gain in most.items() if c not in chosen.setting and gain < IDLE}
 
     @staticmethod
     def _finalists(beam, start, nodes, number):
@@ -208,6 +205,13 @@ class Identification:
                     p = paired(start.score, node.score).p_value
                     best[candidate] = candidate, start.loss - node.loss, p
         return list(best.values())
+
+
+def squares(ahead, residual=None):
+    """Mean squared errors (groups, cells) of an Ahead's residual (W, T, nv), by default that of the
+    nominal model."""
+    residual = ahead.residual([{}])[0] if residual is None else residual
+    return Evidence(ahead, residual, np.zeros((*residual.shape, 0))).reference
 
 
 def no_chance(step, number):

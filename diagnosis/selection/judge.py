@@ -5,7 +5,7 @@ fitted = judge.fit({friction: (0.1,)})
 fitted.setting, fitted.loss
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,8 +41,8 @@ class Fitted:
 
 
 class Judge:
-    """Refits settings in the simulator on the windows of an Ahead; reference: floors of the cells
-    to compare by."""
+    """Refits settings in the simulator on the windows of an Ahead; reference: errors of the cells
+    to compare with, those of the first set that is fitted if none are given."""
 
     def __init__(self, ahead, usual, reference=None, seen=None):
         """seen: {candidate: which of its parameters show}, shared with other looks."""
@@ -61,9 +61,9 @@ class Judge:
             if better is None:
                 break
             setting, residual = better
-        prior = self.cost(setting) / evidence.number
-        final = replace(score, loss=score.loss + prior, groups=score.groups + prior)
-        return Fitted(setting, final, columns, evidence)
+        score = score.plus(self.cost(setting), evidence.number)
+        self.reference = evidence.reference
+        return Fitted(setting, score, columns, evidence)
 
     def _lower(self, columns, evidence, amounts, setting):
         """(setting, residual) after a step that lowers the loss by more than DONE, or None: of the
@@ -83,8 +83,8 @@ class Judge:
 
     def _whole(self, residual, setting, evidence):
         """Loss of a residual with nothing left out, priors included."""
-        plain = Evidence(self.ahead, residual, np.zeros((*residual.shape, 0)), evidence.floor)
-        return plain.score((), *[np.zeros(0)] * 4).loss + self.cost(setting) / evidence.number
+        plain = Evidence(self.ahead, residual, np.zeros((*residual.shape, 0)))
+        return plain.plain() + self.cost(setting) / (evidence.cells * len(evidence.count))
 
     def cost(self, setting):
         """Minus the log prior density of a setting's values, nats; infinite where they are not

@@ -45,7 +45,7 @@ TABLE = {
         ("plain", np.inf, -10, 10),
     ],
     "backlash": [("travel", 0.05, 0.0, 0.3)],
-    "gain": [("times", 0.25, 0.5, 2.0)],
+    "gain": [("times", 0.25, 0.2, 5.0)],
     "bias": [("strength", 0.3, -1.5, 1.5)],
     "saturation": [("used", np.inf, 0.3, np.inf)],
     "delay": [("plain", 0.03, 0.0, 0.15)],

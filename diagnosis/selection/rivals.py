@@ -8,12 +8,13 @@ others[candidate]                                    # [(other, values), ...]
 import numpy as np
 
 from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import Evidence, complexity
+from diagnosis.selection.criterion import Evidence, complexity, paired
 
 # cosine of two effects' columns beside the other findings', from which on one may stand for the
 # other
 ALIKE = 0.7
 TIED = 0.1  # nats of log RMS error by which another member of a class may be worse
+CHANCE = 0.05  # p-value of that, above which it may be worse by any
 # how much more complex another member of a class may be: three components for one number
 FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
@@ -35,7 +36,7 @@ def classes(candidates, judge, chain, fitted, anew, log=lambda what: None):
         if own is not candidate:
             log(f"  better in its class: {candidate} -> {own}")
             swapped = True
-        tied = [(f, o) for f, o in members if f.score.loss < fitted.score.loss + TIED]
+        tied = [(f, o) for f, o in members if _tied(f, fitted)]
         others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
         told = {o for o, _ in others[own]}
         pool = [c for c in candidates if c not in told and c not in fitted.setting]
@@ -53,8 +54,7 @@ def _members(candidates, judge, chain, fitted, candidate):
     out = []
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
-        tied = tried.score.loss < fitted.score.loss + TIED
-        if tried.settled and (tied or tried.loss < fitted.loss):
+        if tried.settled and (_tied(tried, fitted) or tried.loss < fitted.loss):
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
@@ -71,13 +71,19 @@ def _late(pool, judge, chain, fitted, candidate, anew):
     if not near or not world.joints(candidate.place):
         return []
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    least, out = anew(judge, fitted)[0].score.loss + TIED, []
+    begun, out = anew(judge, fitted)[0], []
     for other in near:
         tried = judge.fit({**rest, other: fitted.setting[candidate]}, steps=0)
         tried = anew(judge, tried)[0]
-        if tried.settled and tried.score.loss < least:
+        if tried.settled and _tied(tried, begun):
             out.append((other, tried.setting[other]))
     return out
+
+
+def _tied(tried, fitted):
+    """Whether a set predicts as well as another one, or worse by no more than chance."""
+    worse = paired(tried.score, fitted.score)
+    return worse.gain < TIED or worse.p_value > CHANCE
 
 
 def _alike(judge, chain, fitted, candidate, pool):
@@ -91,7 +97,7 @@ def _alike(judge, chain, fitted, candidate, pool):
     near = _near(chain.world, candidate, pool) + list(rest)
     columns = Columns(chain, rest, judge.usual, near, few=True)
     gone = columns.residual - chain.residual([fitted.setting])[0]
-    evidence = Evidence(chain, gone, columns.array, fitted.evidence.floor)
+    evidence = Evidence(chain, gone, columns.array)
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]
     index = [i for k in kept for i in columns.options[k].columns]
     bare = _left(evidence, index)

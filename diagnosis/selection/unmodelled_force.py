@@ -19,7 +19,8 @@ KNOTS = 9
 BLOCKS = 16  # stretches of time that are left out in turn
 # share of the located force's variance, predicted on stretches left out, that a curve must explain
 LEAST = 0.03
-WAVES = 4.0, 30.0, 0.1  # periods over the travel, from, to and by, of forces that come and go
+# periods over the travel, or a recording, from, to and by, of forces that come and go
+WAVES = 4.0, 30.0, 0.1
 SAMPLED = 2000  # rows in which these are looked for
 CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 
@@ -64,8 +65,8 @@ def dependences(world, trajectory, recordings, most=4):
         force = np.clip(force, -CLIP * size, CLIP * size)
         for variable, x in axes.items():
             for factor, times in _factors(model, trajectory, ctrl, j, variable).items():
-                own = variable == f"position:{name}"
-                for wave in (False, True) if own else (False,):
+                returns = variable in (f"position:{name}", "time")
+                for wave in (False, True) if returns else (False,):
                     curve = _explained(force, x[keep], times[keep], block, variable, wave)
                     if curve.share > LEAST:
                         candidate = world.curve(name, variable, curve.knots, factor, wave)

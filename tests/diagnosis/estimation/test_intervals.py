@@ -47,9 +47,9 @@ def test_noise_without_groups_gives_the_textbooks_interval():
 
 
 def test_intervals_hold_the_truth_of_a_world_with_finer_steps():
-    """Where they missed it while the step was taken for the world's."""
-    rows = [row for seed in (13, 19, 34) for row in trial(seed, 4)]
-    assert sum(row["inside"] for row in rows) == len(rows) == 6
+    """Where they missed it while the step was taken for the world's: of 95 % one in ten may."""
+    rows = [row for seed in (13, 19, 34, 35, 36) for row in trial(seed, 4)]
+    assert sum(row["inside"] for row in rows) >= len(rows) - 1 and len(rows) >= 9
     width = [(float(r["high"]) - float(r["low"])) / float(r["truth"]) for r in rows]
     assert np.median(width) < 0.05
 

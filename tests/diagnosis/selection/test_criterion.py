@@ -10,13 +10,13 @@ from scipy.optimize import lsq_linear
 from scipy.stats import ttest_rel
 from synthetic import clustered, evidence_of, free, scene
 
-from diagnosis.selection.criterion import Score, bounded, complexity, paired
+from diagnosis.selection.criterion import INDEPENDENT, Score, bounded, complexity, paired
 from diagnosis.simulation.simulator import World
 
 
 def scored(groups, cells=0):
-    """A Score of groups (G,)."""
-    return Score(groups.mean(), groups, (), cells)
+    """A Score of groups (G,) of so many cells."""
+    return Score(groups.mean(), groups, groups * cells, ())
 
 
 def test_p_values_of_pure_noise_are_even():
@@ -40,7 +40,8 @@ def test_a_few_groups_decide_together_but_none_alone():
     before, cells = np.zeros(15), 3
     few, one = np.zeros(15), np.zeros(15)
     few[[0, 5, 10]], one[5] = -1.5, -4.5
-    assert paired(scored(before, cells), scored(few, cells)).p_value == pytest.approx(np.exp(-9))
+    likely = np.exp(-INDEPENDENT * 9)
+    assert paired(scored(before, cells), scored(few, cells)).p_value == pytest.approx(likely)
     assert paired(scored(before, cells), scored(one, cells)).p_value > 0.1
 
 
@@ -73,7 +74,7 @@ def test_a_known_improvement_is_found_at_its_size():
 
 
 def test_the_loss_is_the_mean_log_error_of_groups_left_out():
-    """Against a plain loop; a hundredth of the usual square before counts as none."""
+    """Against a plain loop, above the error of the reference."""
     rng, ahead = np.random.default_rng(3), scene(groups=5, windows=1, noise=1e-9)
     column, residual = rng.normal(size=(*ahead.known.shape, 1)), rng.normal(size=ahead.known.shape)
     residual = residual + 2.0 * column[..., 0]
@@ -86,9 +87,35 @@ def test_the_loss_is_the_mean_log_error_of_groups_left_out():
         top = sum(weight[k] * (column[k, ..., 0] * residual[k]).sum() for k in rest)
         value = top / sum(weight[k] * (column[k] ** 2).sum() for k in rest)
         square = np.mean((residual[g] - value * column[g, ..., 0]) ** 2)
-        none = 0.01 * np.median((residual**2).mean((1, 2)))
-        assert score.groups[g] == pytest.approx(0.5 * np.log(square + none), abs=0.005)
+        before = np.mean(residual[g] ** 2)
+        assert score.groups[g] == pytest.approx(0.5 * np.log(square / before), abs=0.005)
     assert score.loss == pytest.approx(score.groups.mean())
+
+
+def test_what_is_within_the_noise_decides_nothing():
+    rng, ahead = np.random.default_rng(6), scene(noise=1.0)
+    column = rng.normal(size=(*ahead.known.shape, 1))
+    evidence = evidence_of(ahead, 0.9 * column[..., 0], column)
+    assert evidence._square(evidence.products(np.array([0, 1])), np.ones(1)).max() < 0.02
+    assert abs(free(evidence, (0,)).loss) < 1e-9
+
+
+def test_what_shows_in_few_groups_is_worth_as_much_and_breaking_others_costs():
+    """Of sixteen groups four err, by ten noises; a column mends them, or mends them and shakes the
+    others."""
+    rng, ahead = np.random.default_rng(7), scene(noise=1.0)
+    noise = rng.normal(size=ahead.known.shape)
+    column = rng.normal(size=(*ahead.known.shape, 1))
+    few = np.isin(ahead.group, (1, 3, 8, 11))[:, None, None]
+    mends, shakes = column * few[..., None], column
+    evidence = evidence_of(ahead, noise + 10 * mends[..., 0], mends)
+    good = free(evidence, (0,))
+    assert -good.loss == pytest.approx(np.log(10), abs=0.2)
+    assert paired(free(evidence, ()), good).p_value < 1e-3
+    both = evidence_of(ahead, noise + 10 * mends[..., 0], shakes)
+    index = np.array([0, 1])
+    square = both._square(both.products(index), np.array([10.0]))
+    assert both._scored(square, ()).loss > 1.0
 
 
 def test_effects_that_do_the_same_tie():

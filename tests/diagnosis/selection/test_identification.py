@@ -50,7 +50,7 @@ def fitted(search, names, loss, settled=True):
     """A Fitted of effects in the elbow with a loss that every group shares but for a little."""
     groups = loss + 1e-3 * np.arange(16)
     setting = {search.world.candidate(name, "elbow"): () for name in names}
-    score = Score(groups.mean(), groups, (), 3)
+    score = Score(groups.mean(), groups, 3 * groups, ())
     whole = score.loss + PRICE * identification.complexity(setting)
     return SimpleNamespace(setting=setting, score=score, loss=whole, settled=settled)
 
@@ -70,7 +70,7 @@ def test_a_set_is_chosen_for_its_worth(search):
 def node(losses, price, *names):
     """A Node of a beam with these losses of groups; names: indices of its options."""
     groups = np.array(losses, float)
-    score = Score(groups.mean(), groups, (), 3)
+    score = Score(groups.mean(), groups, 3 * groups, ())
     return SimpleNamespace(options=names, score=score, loss=groups.mean() + price)
 
 

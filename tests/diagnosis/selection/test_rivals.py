@@ -2,10 +2,11 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from diagnosis.selection import rivals
-from diagnosis.selection.criterion import PRICE
+from diagnosis.selection.criterion import PRICE, Score
 
 
 class Named:
@@ -31,7 +32,8 @@ def chosen(monkeypatch, fitted, losses):
             (c,) = setting
             units = c.effect.simplicity + 1
             loss = losses[c.name]
-            score = SimpleNamespace(loss=loss)
+            groups = loss + np.linspace(-1e-6, 1e-6, 4) * units  # no chance at all
+            score = Score(loss, groups, 4 * groups, ())
             each = {"setting": setting, "score": score, "loss": loss + PRICE * units}
             return SimpleNamespace(**each, settled=True)
 
