@@ -67,6 +67,20 @@ def test_what_is_no_force_is_simulated(here):
     np.testing.assert_allclose(along[1] - along[0], simulated[1] - simulated[0], atol=1e-12)
 
 
+def test_what_is_more_than_a_row_hardly_changes_with_what_stands_beside_it():
+    world, truth, chain = located(VISCOUS)
+    off = {**truth, world.candidate("sensor_scale", "pivot"): (1.02,)}
+    trajectory = Smoother(world, list(chain.trajectory.first)).locate(off)
+    close, ahead = (kind(world, chain.windows, chain.noise) for kind in (Chain, Ahead))
+    close.start(trajectory, off)
+    ahead.start(trajectory)
+    some = [off, {**off, world.candidate("gain", "drive"): (1.001,)}]
+    (a, b), (c, d) = close.residual(some), ahead.residual(some)
+    x, y = (a - b).ravel(), (c - d).ravel()
+    assert x @ y / np.sqrt((x @ x) * (y @ y)) > 0.998
+    np.testing.assert_allclose(close.residual(some[1:])[0], b, atol=1e-12)  # whatever came before
+
+
 def test_coarse_steps_invent_nothing_under_the_effects_that_located_the_motion(here, monkeypatch):
     world, truth, chain = here
     trajectory = Smoother(world, list(chain.trajectory.first)).locate(truth)
