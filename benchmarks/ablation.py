@@ -27,7 +27,8 @@ WHOLE = "whole"  # the method as it is
 RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches it off}
     WHOLE: {},
     "no price of complexity": {"diagnosis.selection.criterion:PRICE": 0.0},
-    "no start states of its own": {"diagnosis.selection.identification:ANEW": 0},
+    "start states are certain": {"diagnosis.estimation.ahead:FREE": 0.0},
+    "a name stands whatever it leaves": {"diagnosis.unnamed:INSTEAD": 2.0},
     "no correction for the number looked at": {"diagnosis.selection.identification:LEVEL": 1.0},
     "a beam of one": {"diagnosis.selection.beam:WIDTH": 1},
     "no values at full size": {"diagnosis.selection.columns:LADDER": ()},

@@ -20,10 +20,8 @@ from diagnosis.selection.criterion import PRICE, complexity, paired
 from diagnosis.selection.identification import Found, Identification, no_chance
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
+from diagnosis.unnamed import INSTEAD
 
-# of a name's force, the size of a curve beside it from which on the name is only the nearest, and
-# from which on the curve takes its place
-NEAREST, INSTEAD = 0.25, 0.5
 UNNAMED = 2  # units of complexity of a force where nothing has a name
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 
@@ -31,16 +29,15 @@ STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 @dataclass
 class Outcome:
     """All that the report is made of: found (Found), fitted (Fitted set), trajectory (Trajectory
-    under it), others {Candidate: [(other, values)]}, p_values, adequacy {Candidate: variables
-    left}, strains {Candidate: words}, left ([Dependence] under the final set), dependences (under
-    the nominal model), handed (Handed), train_check and held_check (Check)."""
+    under it), others {Candidate: [(other, values)]}, p_values, strains {Candidate: words}, left
+    ([Dependence] under the final set), dependences (under the nominal model), handed (Handed),
+    train_check and held_check (Check)."""
 
     found: Found
     fitted: Fitted
     trajectory: Trajectory
     others: dict
     p_values: dict
-    adequacy: dict
     strains: dict
     left: list
     dependences: list
@@ -94,7 +91,7 @@ def _checked(search, found, fitted, others, log):
     """The Outcome so far: curves tried beside the names, and what is left."""
     world, train, judge = search.world, search.train, found.judge
     dependences = unmodelled_force.dependences(world, found.first, train)
-    trajectory, adequacy = found.trajectory, {}
+    trajectory = found.trajectory
     left = unmodelled_force.dependences(world, trajectory, train)
     for rest in left[:2]:
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=2)
@@ -110,15 +107,13 @@ def _checked(search, found, fitted, others, log):
             fitted = search.pruned(judge, beside) if mine else beside
         if rest.candidate in fitted.setting:
             break
-        if rest.size > NEAREST * size:
-            adequacy |= {c: rest.variables for c in mine}
-    return Outcome(found, fitted, trajectory, others, {}, adequacy, {}, left, dependences)
+    return Outcome(found, fitted, trajectory, others, {}, {}, left, dependences)
 
 
 def _classes(search, found, fitted, log, candidates):
     """(Fitted, {candidate: [(other, values)]}): the classes of its findings among candidates."""
     some = candidates, found.judge, found.chain, fitted
-    return rivals.classes(*some, search.begun_anew, log)
+    return rivals.classes(*some, log)
 
 
 def _at(world, candidate, joint):
@@ -169,6 +164,8 @@ def _hand_over(search, held, kept_back, outcome, log):
         less = judge.fit({other: x for other, x in kept.items() if other is not c}, steps=2)
         outcome.p_values[c] = paired(less.score, outcome.fitted.score).p_value
         outcome.strains[c] = _strain(c, v, plausible(c, found.usual))
+    if set(kept) != set(found.fitted.setting):
+        outcome.trajectory = found.smoother.locate(kept, outcome.trajectory, passes=1)
     check.locate(kept)
     outcome.held_check = check
     smoother = found.smoother

@@ -14,9 +14,9 @@ from diagnosis.estimation import prediction_error, windowing
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults
+from diagnosis.unnamed import led
 
 SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing
-ENOUGH = 0.5  # of the error that findings remove, up to which what is left leaves them adequate
 COLOURED = 3.0  # of its error under white noise, what noise of another kind may reach
 POINTS = 400  # of a located force that are told
 
@@ -53,12 +53,10 @@ def assemble(world, train, held_out, outcome):
     if others := sensor_faults.errors(world, settings, check.recordings):
         figures["held_out"]["sensors"] = others
     figure = figures["held_out"]
-    findings = _findings(world, outcome, bounds, figure)
     left = unexplained(figure["before"], figure["after"], figure["floor"], check.scatter)
-    if not enough(left, figure["before"], figure["after"]):
-        findings = [{**finding, "adequate": False} for finding in findings]
-    if not findings and not outcome.earned and figure["after"] < COLOURED * figure["floor"]:
+    if not outcome.earned and figure["after"] < COLOURED * figure["floor"]:
         left = 0.0  # noise that is not white does as much
+    findings = led(world, outcome, _findings(world, outcome, bounds, figure), left > 0)
     hint = outcome.left[0] if outcome.left and left > 0 else None
     summary = {
         "format": 2,
@@ -89,14 +87,15 @@ def assemble(world, train, held_out, outcome):
 
 
 def _findings(world, outcome, bounds, figure):
-    """All findings, the most important first: of the model, of a while, of sensors."""
+    """All findings, the most important first, as (candidate or None, finding): of the model, of a
+    while, of sensors."""
     settings = outcome.fitted.setting
-    found = [_finding(world, c, outcome, bounds, figure) for c in settings]
+    found = [(c, _finding(world, c, outcome, bounds, figure)) for c in settings]
     if outcome.event:
-        found.append(of_event(outcome.event))
-    recordings = outcome.found.smoother.recordings
-    found += sensor_faults.faults(world, settings, recordings, outcome.trajectory, outcome.event)
-    return sorted(found, key=lambda f: -f["evidence"]["held_out_error_removed"])
+        found.append((None, of_event(outcome.event)))
+    given = world, settings, outcome.found.smoother.recordings, outcome.trajectory, outcome.event
+    found += [(None, fault) for fault in sensor_faults.faults(*given)]
+    return sorted(found, key=lambda pair: -pair[1]["evidence"]["held_out_error_removed"])
 
 
 def verdict(findings, something):
@@ -116,7 +115,6 @@ def _finding(world, candidate, outcome, bounds, figure):
         else None
     )
     before, after = figure["before"], figure["after"]
-    rest = outcome.adequacy.get(candidate)
     return {
         "effect": candidate.effect.name,
         "place": place_of(candidate),
@@ -125,7 +123,7 @@ def _finding(world, candidate, outcome, bounds, figure):
             "held_out_error_removed": removed(handed.without[candidate], after, before),
             "p_value": outcome.p_values[candidate],
         },
-        "adequate": not curve and rest is None and certain(candidate, bounds[candidate]),
+        "adequate": not curve and certain(candidate, bounds[candidate]),
         "strains": outcome.strains.get(candidate),
         "depends_on": [v for v in (candidate.effect.variable, candidate.effect.factor) if v]
         if curve
@@ -137,7 +135,6 @@ def _finding(world, candidate, outcome, bounds, figure):
             for c, v in outcome.others.get(candidate, [])
         ],
         **({"curve": form} if curve else {}),
-        **({"rest_depends_on": list(rest)} if rest else {}),
     }
 
 
@@ -169,12 +166,6 @@ def certain(candidate, bounds):
     """Whether the interval of some value leaves out the nominal one."""
     seen = [(p, b) for p, b in zip(candidate.parameters, bounds) if b is not None]
     return any(not low <= p.nominal <= high for p, (low, high) in seen)
-
-
-def enough(left, before, after):
-    """Whether findings explain most of what could be: the error that is left above noise is at most
-    half of what they remove. left: share of the nominal model's squared error."""
-    return not left or left * before**2 <= ENOUGH**2 * max(before**2 - after**2, 0.0)
 
 
 def place_of(candidate):

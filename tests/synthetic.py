@@ -7,8 +7,9 @@ import numpy as np
 from diagnosis.selection.criterion import Evidence
 
 
-def scene(groups=16, windows=3, rows=20, channels=1, bands=1, noise=1e-3):
-    """As much of an Ahead as an Evidence reads: groups of windows, all rows measured."""
+def scene(groups=16, windows=3, rows=20, channels=1, bands=1, noise=1e-3, begun=None):
+    """As much of an Ahead as an Evidence reads: groups of windows, all rows measured. begun (W,
+    rows, channels, m): what start states change, nothing by default."""
     W = groups * windows
     return SimpleNamespace(
         group=np.repeat(np.arange(groups), windows),
@@ -16,6 +17,7 @@ def scene(groups=16, windows=3, rows=20, channels=1, bands=1, noise=1e-3):
         known=np.ones((W, rows, channels), bool),
         channels=[np.array([c]) for c in range(channels)],
         noise=np.full(channels, noise),
+        freedom=lambda: np.zeros((W, rows, channels, 0)) if begun is None else begun,
     )
 
 

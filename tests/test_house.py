@@ -16,6 +16,7 @@ FLOORS = (
     ("trpo", "diagnosis.recordings", "diagnosis.simulation", "diagnosis.trials", "diagnosis.demo"),
     ("rgat", "diagnosis.estimation", "diagnosis.nominal", "diagnosis.report", "prove"),
     ("diagnosis.selection", "diagnosis.handover", "diagnosis.design"),
+    ("diagnosis.unnamed",),
     ("diagnosis.findings",),
     ("diagnosis.estimator",),
     ("diagnosis.command",),

@@ -91,15 +91,15 @@ class AirDrag(Effect):
 
 @catalogue
 class TimeStep(Effect):
-    """The simulator's own integration step, s: what it leaves out is no physics."""
+    """The simulator's own integration step, s: what it leaves out is no physics, and in every
+    simulator."""
 
-    name, kinds = "time_step", ("world",)
+    name, kinds, simplicity = "time_step", ("world",), 0
 
     def parameters(self, model, i):
         h = model.opt.timestep
-        return (
-            Parameter("seconds", "s", h, h / 2, h, -h / 4),
-        )  # a half leaves half of the error, and tells that there is one; finer is dear
+        # a quarter leaves a quarter of the error; finer is dear
+        return (Parameter("seconds", "s", h, h / 4, h, -h / 4),)
 
     def probes(self, model, i, recordings):
         return model.opt.timestep / np.array([[2.0]])

@@ -15,6 +15,7 @@ HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
 FEWEST = 16  # windows that there should be, if shorter ones make up for it
 MOST = 32  # windows that are simulated, evenly chosen of more
 GROUPS = 16  # of neighbouring windows, the units that are left out and compared
+FREE = 1.0  # share of what the smoother leaves open of a start state, that a prediction may use
 
 
 def cut_ahead(recordings, longest=HORIZONS[-1]):
@@ -55,6 +56,11 @@ class Ahead:
         self.noise, self.step = noise, self.model.opt.timestep
         self.travel = self._travel()
         self.qpos, self.qvel = windowing.recorded_starts(self.model, windows)
+        self.spread, self.base, self._freedom = (
+            np.zeros((len(windows), 2 * self.model.nv)),
+            {},
+            None,
+        )
 
     def _travel(self):
         start = self.measured[:, :1]
@@ -69,10 +75,33 @@ class Ahead:
             10 * np.where(np.isfinite(self.noise), self.noise, 1.0),
         )
 
-    def start(self, trajectory):
-        """Begin the windows at a Trajectory's states."""
+    def start(self, trajectory, setting=None):
+        """Begin the windows at a Trajectory's states; setting: that under which it was located."""
         self.qpos, self.qvel = trajectory.at(self.windows)
         self.step = trajectory.step or self.model.opt.timestep
+        rows = trajectory.begin(self.windows)
+        self.spread = FREE * np.concatenate([trajectory.qpos_sd[rows], trajectory.qvel_sd[rows]], 1)
+        self.base, self._freedom = setting or {}, None
+
+    def freedom(self):
+        """(W, T, nv, 2 nv): how predictions change per standard deviation of the start states."""
+        if self._freedom is None:
+            self._freedom = self._moved_starts()
+        return self._freedom
+
+    def _moved_starts(self):
+        nv, n = self.model.nv, 2 * self.model.nv
+        W, moved = len(self.windows), np.zeros((1 + n, len(self.windows), n))
+        moved[1 + np.arange(n), :, np.arange(n)] = self.spread.T
+        moved = moved.reshape(-1, n)
+        qpos = windowing.integrate(self.model, np.tile(self.qpos, (1 + n, 1)), moved[:, :nv])
+        qvel = np.tile(self._velocities(self.base, 1), (1 + n, 1)) + moved[:, nv:]
+        each = [self.base] * len(moved)
+        qpos = self.world.simulate(each, qpos, qvel, self.windows * (1 + n))[0]
+        gaps = self._gaps(qpos.reshape(1 + n, W, *qpos.shape[1:]))
+        change = gaps[0] - gaps[1:]
+        change[(abs(gaps) >= self.travel)[1:] | (abs(gaps[0]) >= self.travel)] = 0.0
+        return np.moveaxis(change, 0, -1)
 
     def residual(self, settings, refine=1):
         """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther
@@ -83,10 +112,14 @@ class Ahead:
         qpos = self.world.simulate(
             each, np.tile(self.qpos, (n, 1)), qvel, self.windows * n, refine
         )[0]
-        out = np.empty((n, *self.known.shape))
-        for k in range(n):
+        return self._gaps(qpos.reshape(n, W, *qpos.shape[1:]))
+
+    def _gaps(self, qpos):
+        """Measured less predicted (n, W, T, nv) of predictions (n, W, T, nq)."""
+        out = np.empty((len(qpos), *self.known.shape))
+        for k, predicted in enumerate(qpos):
             with np.errstate(invalid="ignore", over="ignore"):
-                gap = windowing.difference(self.model, qpos[k * W : (k + 1) * W], self.measured)
+                gap = windowing.difference(self.model, predicted, self.measured)
             gap = np.where(np.isfinite(gap), np.clip(gap, -self.travel, self.travel), self.travel)
             out[k] = np.where(self.known, gap, 0.0)
         return out

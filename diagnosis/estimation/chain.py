@@ -23,8 +23,7 @@ class Chain(Ahead):
     touches, and effects with states or sensors of their own, are simulated as in Ahead."""
 
     def start(self, trajectory, setting=None):
-        """Begin the windows at a Trajectory's states; setting: that under which it was located."""
-        super().start(trajectory)
+        super().start(trajectory, setting)
         self.trajectory, self.map = trajectory, None
         last = np.array([w.last - w.first for w in self.windows])
         first = trajectory.begin(self.windows)
@@ -38,7 +37,7 @@ class Chain(Ahead):
         beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
         self.beside = np.where(self.known, beside, 0.0)
         # columns are differences: what a coarse step does wrong it does with an effect and without
-        self.coarse, self.base = coarse(self.world, trajectory.first), self.plain(setting or {})
+        self.coarse, self.base = coarse(self.world, trajectory.first), self.plain(self.base)
         rough = self._rows({**self.coarse, **self.base}, self.begin)
         self.finer, self.beyond = self._rows(self.base, self.begin) - rough, {}
         self.whole = self._begun(self.windows)
@@ -49,7 +48,7 @@ class Chain(Ahead):
         if not windows:
             return None
         ahead = Ahead(self.world, windows, self.noise)
-        ahead.start(self.trajectory)
+        ahead.start(self.trajectory, self.base)
         return ahead
 
     def residual(self, settings, refine=1):
@@ -63,6 +62,20 @@ class Chain(Ahead):
             rest = self.contacts.residual(settings, refine)
             out[:, self.touched] = 0.0
             out[:, self.touched, : rest.shape[2]] = rest
+        return out
+
+    def _moved_starts(self):
+        """As of Ahead, along the chain."""
+        nv, T = self.model.nv, self.rows.shape[1]
+        out = np.zeros((*self.known.shape, 2 * nv))
+        x = self.spread[:, None] * np.eye(2 * nv)
+        for t in range(T - 1):
+            x = self.trajectory.transition[self.rows[:, t]] @ x * self.carried[:, t, None, None]
+            out[:, t + 1] = np.where(self.known[:, t + 1, :, None], x[:, :nv], 0.0)
+        if self.contacts:
+            rest = self.contacts.freedom()
+            out[self.touched] = 0.0
+            out[self.touched, : rest.shape[1]] = rest
         return out
 
     def _along(self, settings, out):
@@ -81,12 +94,22 @@ class Chain(Ahead):
         new = {frozenset(m.items()): m for m in more if m}
         new = {key: m for key, m in new.items() if key not in self.beyond}
         if new:
-            every = [self.base, *({**self.base, **m} for m in new.values())]
-            first, *rest = self.whole.residual(every)
-            self.beyond |= {key: both - first for key, both in zip(new, rest)}
+            for rough in (True, False):  # but for the time step itself, at coarse ones
+                steps = {**self.coarse, **self.base} if rough else self.base
+                some = {k: m for k, m in new.items() if rough != self._steps(m)}
+                if some:
+                    first, *rest = self.whole.residual(
+                        [steps, *({**steps, **m} for m in some.values())]
+                    )
+                    self.beyond |= {key: both - first for key, both in zip(some, rest)}
         for row, m in zip(out, more):
             if m:
                 row += self.beyond[frozenset(m.items())]
+
+    @staticmethod
+    def _steps(setting):
+        """Whether a setting has a time step of its own."""
+        return any(c.effect.name == "time_step" for c in setting)
 
     def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""

@@ -21,7 +21,7 @@ def intervals(fitted):
     """{candidate: [(low, high), ...]} of a Fitted set; None for a parameter that the recordings do
     not show."""
     out, options = {}, fitted.columns.options
-    index = np.concatenate([[0], *[np.array(o.columns) + 1 for o in options]]).astype(int)
+    index = [i for o in options for i in o.columns]
     middle, half = without_step(fitted, index)
     at = 0
     for c, values in fitted.setting.items():
@@ -43,24 +43,24 @@ def intervals(fitted):
 
 
 def without_step(fitted, index):
-    """Middles and half widths (p,) of the amounts of columns index[1:], the time step being free.
+    """Middles and half widths (p,) of the amounts of columns index (p,), the time step being free.
 
     What half the step changes is one more column, of which a world without steps holds twice the
     amount; where the recordings do not tell it from the others, it may be anything up to that.
     """
-    columns, p = fitted.columns, len(index) - 1
+    columns, p = fitted.columns, len(index)
     half, moves = half_widths(fitted.evidence, index)
     if not p:
         return moves, half
     change = columns.residual - columns.ahead.residual([fitted.setting], refine=2)[0]
     change = np.where(columns.lost, 0.0, change)
-    stack = np.concatenate([columns.array[..., index[1:] - 1], change[..., None]], -1)
+    stack = np.concatenate([columns.array[..., index], change[..., None]], -1)
     kind = type(fitted.evidence)  # of a layer above this one
     evidence = kind(columns.ahead, columns.residual, stack)
-    every = np.arange(p + 2)
+    every, none = np.arange(p + 1), np.zeros(p + 1)
     wide, amounts = half_widths(evidence, every)
-    weight = evidence.weight(every, np.zeros(p + 1))
-    whole = np.einsum("gc,gcij->ij", weight, evidence.products(every))[1:, 1:]
+    g = evidence.freed(every, none)
+    whole = np.einsum("gc,gcij->ij", evidence.weight(g, none), g)[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     even = whole / np.outer(scale, scale)
     inside = even[:p, :p] + UNSEEN * np.eye(p)
@@ -75,12 +75,13 @@ def without_step(fitted, index):
 
 
 def half_widths(evidence, index):
-    """Half widths and remaining Gauss-Newton moves (p,) of columns index[1:] about amounts zero."""
-    p = len(index) - 1
+    """Half widths and remaining Gauss-Newton moves (p,) of columns index (p,), amounts zero."""
+    p = len(index)
     if not p:
         return np.zeros(0), np.zeros(0)
-    weight = evidence.weight(index, np.zeros(p))
-    each = np.einsum("gc,gcij->gij", weight, evidence.products(index))
+    g = evidence.freed(index, np.zeros(p))
+    weight = evidence.weight(g, np.zeros(p))
+    each = np.einsum("gc,gcij->gij", weight, g)
     scale = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], 1e-300))
     gram, score = each[:, 1:, 1:] / np.outer(scale, scale), each[:, 1:, 0] / scale
     whole = gram.sum(0)
@@ -94,16 +95,16 @@ def half_widths(evidence, index):
     back = (vectors[:, seen] * np.sqrt(values[seen])) @ vectors[:, seen].T
     meat = np.zeros((p, p))
     shares = np.empty((len(gram), p))
-    for g, (H, s) in enumerate(zip(gram, left)):
+    for k, (H, s) in enumerate(zip(gram, left)):
         hat = root @ H @ root
         e, u = np.linalg.eigh(hat)
         factor = (u / np.sqrt(np.clip(1 - e, 0.05, 1.0))) @ u.T
         corrected = back @ factor @ root @ s
         meat += np.outer(corrected, corrected)
-        shares[g] = np.einsum("ij,jk,ki->i", inverse, H, inverse) / np.maximum(
+        shares[k] = np.einsum("ij,jk,ki->i", inverse, H, inverse) / np.maximum(
             np.diag(inverse), 1e-300
         )
-    curvature = _curvature(evidence, index, weight, root / scale[:, None])
+    curvature = _curvature(g, weight, root / scale[:, None])
     bread = root @ np.linalg.inv(curvature) @ root.T
     covariance = bread @ meat @ bread
     freedom = np.maximum(1 / np.maximum((shares**2).sum(0), 1e-9) - 1, 1.0)
@@ -112,13 +113,13 @@ def half_widths(evidence, index):
     return half / scale, moves / scale
 
 
-def _curvature(evidence, index, weight, root):
+def _curvature(g, weight, root):
     """The loss's curvature (p, p) over that of weighted least squares, in whitened columns.
 
     The log of a cell's square bends less than the square itself, for a cell that errs much counts
     less: 1/2 log s has the second derivative X'X / ns - 2 X'r r'X / (ns)^2.
     """
-    score = evidence.products(index)[:, :, 0, 1:] @ root
+    score = g[:, :, 0, 1:] @ root
     less = np.einsum("gc,gci,gcj->ij", 2 * weight**2, score, score)
     values, vectors = np.linalg.eigh(np.eye(len(root)) - less)
     return (vectors * np.clip(values, FLAT, None)) @ vectors.T

@@ -60,6 +60,8 @@ def _facts(finding):
             facts.append(f"removes {100 * value:.0f} % of {REMOVES[key]}")
         elif key == "p_value":
             facts.append(f"p {text.p_value(value)}")
+        elif key == "error_left":
+            facts.append(f"{100 * value:.0f} % of the error there is left")
         else:
             facts.append(f"{key.replace('_', ' ')} {text.number(value)}")
     return [*facts, WRITTEN[finding["written_as"]]]

@@ -26,6 +26,7 @@ ALWAYS_THERE = {
     "ground_height",
     "link_length",
 }  # a nominal 0 of theirs is a value like any other
+CANNOT_TELL = "these recordings cannot tell it from"
 UNSTEADY = 0.01  # p, below which recordings do not agree on one value
 NO_EFFECT = "no effect of the catalogue improves the prediction of recordings held out."
 UNSEEN = "not seen in these recordings"
@@ -328,7 +329,8 @@ def terminal(summary: dict, out: str, files: list[str]) -> str:
             f"{effect_words(other['effect'])} of {place_words(other['place'])}"
             for other in finding.get("also_possible") or []
         )
-        lines += [f"    (these recordings cannot tell it from: {rivals})"] if rivals else []
+        words = "the nearest names" if finding["effect"] == "unknown" else CANNOT_TELL
+        lines += [f"    ({words}: {rivals})"] if rivals else []
         lines += [f"    ({doubt})" for doubt in doubts(finding)]
     lines.append(sentence(error_words(summary)))
     left = unexplained_words(summary)

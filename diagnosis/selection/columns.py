@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.estimation import windowing
+from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.first_look import likely
 from diagnosis.selection.plausibility import plausible
 
@@ -113,6 +114,10 @@ class Columns:
             kept = likely(ahead, setting, starts)
             starts = [start for start in starts if start[0] in kept]
         self._simulate(starts + [self._whole(candidate, values) for candidate, values in curves])
+
+    def evidence(self, reference=None):
+        """The Evidence of the residual and all columns."""
+        return Evidence(self.ahead, self.residual, self.array, reference)
 
     @property
     def array(self):

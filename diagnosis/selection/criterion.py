@@ -21,8 +21,8 @@ from diagnosis.common.distributions import t_sf
 
 NOISE = 0.3  # of the noise, that counts as none
 BEYOND = 1.5  # of the noise, from which on an error counts
-ITERATIONS = 3  # of reweighted least squares
-INDEPENDENT = 2.0  # errors of a cell, as which it counts where a few groups decide
+ITERATIONS = 4  # of reweighted least squares
+INDEPENDENT = 2.0  # errors as which the rows of a cell count, where a few groups or windows decide
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
 PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
 
@@ -77,72 +77,112 @@ def paired(before, after):
 
 
 class Evidence:
-    """Sums of products of the residual (first) and columns per group and cell: everything a
-    hypothesis needs."""
+    """Sums of products of the residual (first) and columns per window and cell: everything a
+    hypothesis needs.
+
+    Start states are no part of a hypothesis. Each window's is free within what the smoother knows
+    of it: under every hypothesis it is the likeliest one, given the errors that this leaves.
+    """
 
     def __init__(self, ahead, residual, columns, reference=None):
         """reference (G, cells): mean squared errors of what others are compared with; None takes
         this residual's."""
         groups, bands = ahead.group.max() + 1, range(ahead.band.max() + 1)
-        stack = np.concatenate([residual[..., None], columns], -1)
         cells = [(dofs, b) for dofs in ahead.channels for b in bands]
-        self.count = np.zeros((groups, len(cells)))
+        stack = np.concatenate([residual[..., None], columns, ahead.freedom()], -1)
         self.channels = len(ahead.channels)
         self.noise, rows = np.zeros(len(cells)), {}
+        counted = np.zeros((len(residual), len(cells)))
         for j, (dofs, b) in enumerate(cells):
             inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
             finite = np.isfinite(ahead.noise[dofs])
             self.noise[j] = np.sqrt(np.mean(np.where(finite, ahead.noise[dofs], 0.0) ** 2))
-            for g in range(groups):
-                w = np.flatnonzero((ahead.group == g) & inside.any((1, 2)))
-                if len(w):
-                    rows[g, j] = stack[w][:, :, dofs][inside[w]]
-                    self.count[g, j] = len(rows[g, j])
-        self._keep(rows, stack.shape[-1])
+            counted[:, j] = inside.sum((1, 2))
+            for w in np.flatnonzero(counted[:, j]):
+                rows[w, j] = stack[w][:, dofs][inside[w]]
+        self.group = np.arange(groups)[:, None] == ahead.group  # (G, W)
+        self.rows, self.count = counted, self.group @ counted
         self.floor = (NOISE * self.noise) ** 2 + 1e-30
-        square = self.own[:, :, 0] / np.maximum(self.count, 1)
+        self._keep(rows, counted.shape, columns.shape[-1] + 1)
+        square = self.squares((), np.zeros(0))
         self.reference = square if reference is None else reference
         seen = (self.count > 0).any(0).sum()
         self.cells = max(seen / max(self.channels, 1), 1 / groups)  # of a channel in a group
         counting = self._counting(self.reference).sum() / max(seen, 1)
         self.number = self.cells * max(counting, 1.0)
 
-    def _keep(self, rows, width):
-        """Keep rows {(group, cell): (n, width)}, columns first, and their squares.
+    def _keep(self, rows, shape, width):
+        """Keep rows {(window, cell): (n, width + m)}, columns first, and their products with the
+        starts.
 
         Products of all columns with all would take the square of their number: those asked for are
         worked out when they are.
         """
-        where = sorted(rows)
-        self.columns = np.empty((width, sum(len(rows[k]) for k in where)))
-        self.cell = np.repeat(
-            np.array([g * self.count.shape[1] + j for g, j in where], int),
-            [len(rows[k]) for k in where],
-        )
-        self.first = np.flatnonzero(np.diff(self.cell, prepend=-1))
-        for k, a in zip(where, self.first):
-            self.columns[:, a : a + len(rows[k])] = rows[k].T
-        self.own = np.stack([self._sums(c * c) for c in self.columns], -1)
+        where, self.shape = sorted(rows), shape
+        every = np.concatenate([rows[k] for k in where]).T if rows else np.zeros((width, 0))
+        lengths = [len(rows[k]) for k in where]
+        self.first = np.cumsum([0, *lengths[:-1]]) if rows else np.zeros(0, int)
+        self.cell = np.repeat(np.array([w * shape[1] + j for w, j in where], int), lengths)
+        self.columns, begun = np.ascontiguousarray(every[:width]), every[width:]
+        m = len(begun)
+        self.starts, self.crossed = np.zeros((*shape, m, m)), np.zeros((*shape, m, width))
+        for (w, j), a, n in zip(where, self.first, lengths):
+            block = begun[:, a : a + n]
+            self.starts[w, j] = block @ block.T
+            self.crossed[w, j] = block @ self.columns[:, a : a + n].T
 
     def _sums(self, product):
-        """(G, cells) of a product of columns (N,)."""
-        out = np.zeros(self.count.size)
+        """(W, cells) of a product of columns (N,)."""
+        out = np.zeros(self.shape[0] * self.shape[1])
         if len(product):
             out[self.cell[self.first]] = np.add.reduceat(product, self.first)
-        return out.reshape(self.count.shape)
+        return out.reshape(self.shape)
 
-    def products(self, index):
-        """(G, cells, p, p): sums of products of columns index (p,), 0 being the residual."""
+    def _products(self, index):
+        """(W, cells, p, p): sums of products of columns index (p,), 0 being the residual, start
+        states as they are."""
         chosen = self.columns[index]
-        out = np.empty((*self.count.shape, len(index), len(index)))
+        out = np.empty((*self.shape, len(index), len(index)))
         for i, a in enumerate(chosen):
-            out[:, :, i, i] = self.own[:, :, index[i]]
-            for j in range(i):
+            for j in range(i + 1):
                 out[:, :, i, j] = out[:, :, j, i] = self._sums(a * chosen[j])
         return out
 
+    def _moved(self, crossed, square):
+        """(W, m, p): how many standard deviations start states follow columns, from their products
+        crossed (W, cells, m, p) with the starts, where errors are of mean squares (G, cells)."""
+        # rows err alike where a model does: those of a cell count as few errors
+        weight = (
+            INDEPENDENT / np.maximum(self.rows, 1) * (self.group.T @ (1 / (square + self.floor)))
+        )
+        m = self.starts.shape[-1]
+        inside = np.einsum("wc,wcij->wij", weight, self.starts) + np.eye(m)
+        return np.linalg.solve(inside, np.einsum("wc,wcip->wip", weight, crossed))
+
+    def _freed(self, products, crossed, square):
+        """(G, cells, p, p): products of columns from which start states have taken their share."""
+        moved = self._moved(crossed, square)[:, None]
+        shared = np.swapaxes(crossed, 2, 3) @ moved
+        left = products - shared - np.swapaxes(shared, 2, 3)
+        left += np.swapaxes(moved, 2, 3) @ self.starts @ moved
+        return np.tensordot(self.group.astype(float), left, 1)
+
+    def freed(self, columns, amounts):
+        """(G, cells, p + 1, p + 1): sums of products of the residual and columns (p,), start states
+        free, where these have amounts (p,)."""
+        index = np.concatenate([[0], np.asarray(columns, int) + 1])
+        products, crossed = self._products(index), self.crossed[..., index]
+        g = np.tensordot(self.group.astype(float), products, 1)
+        for _ in range(ITERATIONS):
+            g = self._freed(products, crossed, self._square(g, amounts))
+        return g
+
+    def squares(self, columns, amounts):
+        """Mean squared error (G, cells) at amounts (p,) of columns (p,)."""
+        return self._square(self.freed(columns, amounts), amounts)
+
     def _square(self, g, amounts):
-        """Mean squared error (G, cells) of amounts (p,) or (G, p), from products() g."""
+        """Mean squared error (G, cells) of amounts (p,) or (G, p), from products g."""
         z = np.concatenate([np.ones((*amounts.shape[:-1], 1)), -amounts], -1)
         z = np.broadcast_to(z, (len(g), z.shape[-1]))
         square = np.einsum("gi,gcij,gj->gc", z, g, z, optimize=PAIRS)
@@ -163,7 +203,7 @@ class Evidence:
 
     def plain(self):
         """Mean log RMS over all groups, counted alike, summed over channels: what a fit lowers."""
-        square = self.own[:, :, 0] / np.maximum(self.count, 1)
+        square = self.squares((), np.zeros(0))
         log = np.where(self.count > 0, 0.5 * np.log(square + self.floor), 0.0)
         return float(log.sum() / max((self.count > 0).sum(), 1) * self.channels)
 
@@ -174,23 +214,22 @@ class Evidence:
         quadratic prior, precision/2 amount² - pull amount, in nats.
         """
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
-        p, amounts, g = len(index) - 1, np.zeros(len(index) - 1), self.products(index)
-        if not p:
-            return self._scored(self._square(g, amounts), amounts)
+        amounts = np.zeros(len(columns))
+        if not len(columns):
+            return self._scored(self.squares((), amounts), amounts)
+        products, crossed = self._products(index), self.crossed[..., index]
+        g = np.tensordot(self.group.astype(float), products, 1)
         for _ in range(ITERATIONS):
-            each = np.einsum("gc,gcij->gij", self._weight(g, amounts), g)
-            whole = each.sum(0)
+            whole = np.einsum("gc,gcij->ij", self.weight(g, amounts), g)
             amounts = bounded(whole[1:, 1:] + np.diag(precision), whole[1:, 0] + pull, low, high)
-        each = np.einsum("gc,gcij->gij", self._weight(g, amounts), g)
+            g = self._freed(products, crossed, self._square(g, amounts))
+        each = np.einsum("gc,gcij->gij", self.weight(g, amounts), g)
         rest = each.sum(0) - each
         left = each_bounded(rest[:, 1:, 1:] + np.diag(precision), rest[:, 1:, 0] + pull, low, high)
         return self._scored(self._square(g, left), amounts)
 
-    def weight(self, index, amounts):
+    def weight(self, g, amounts):
         """(G, cells): weights of squares at which least squares lowers the sum of logs."""
-        return self._weight(self.products(index), amounts)
-
-    def _weight(self, g, amounts):
         square = self._square(g, amounts)
         return np.where(
             self.count > 0, 1 / (np.maximum(self.count, 1) * (square + self.floor)), 0.0
@@ -200,9 +239,19 @@ class Evidence:
         """In-sample gain (K,) in nats of each further column beside some at their amounts: a first
         look."""
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
-        weight = self.weight(index, np.asarray(amounts, float))
-        beside = self.columns @ (self.columns[index] * weight.ravel()[self.cell]).T
-        own = np.einsum("gc,gck->k", weight, self.own)[1:]
+        g = self.freed(columns, np.asarray(amounts, float))
+        square = self._square(g, np.asarray(amounts, float))
+        weight = self.group.T @ self.weight(g, np.asarray(amounts, float))  # (W, cells)
+        moved = self._moved(self.crossed, square)
+        crossed = np.einsum("wc,wcik->wik", weight, self.crossed)
+        # of each column what start states leave of it: x - S moved
+        taken = crossed - np.einsum("wc,wcij->wij", weight, self.starts) @ moved / 2
+        row = weight.ravel()[self.cell]
+        beside = self.columns @ (self.columns[index] * row).T
+        beside -= np.einsum("wik,wip->kp", taken, moved[..., index])
+        beside -= np.einsum("wik,wip->kp", moved, taken[..., index])
+        own = np.einsum("kn,n,kn->k", self.columns, row, self.columns)
+        own = (own - 2 * np.einsum("wik,wik->k", taken, moved))[1:]
         inside = beside[index[1:], 1:] + np.diag(precision)
         score = beside[1:, 0] - beside[1:, 1:] @ amounts
         curve = own.copy()

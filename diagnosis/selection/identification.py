@@ -4,7 +4,6 @@ found = Identification(world, train).run()
 found.fitted.setting; found.trajectory
 """
 
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,8 +21,6 @@ from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
-STAYS = 0.025  # loss that other start states still remove, from which on they stay
-ANEW = 4  # times that a set is fitted to start states of its own, at most
 CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
 
@@ -65,7 +62,7 @@ class Identification:
         self.screen = Chain(self.world, self.ahead.windows, smoother.position_noise)
         setting, ranking = {}, []
         for i in range(ROUNDS):
-            self.ahead.start(trajectory)
+            self.ahead.start(trajectory, setting)
             self.screen.start(trajectory, setting)
             self.trajectory = trajectory
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
@@ -76,7 +73,7 @@ class Identification:
             setting = fitted.setting
             trajectory = smoother.locate(setting, trajectory, passes=1)
         else:  # rounds ended with a set from which nothing has begun
-            self.ahead.start(trajectory)
+            self.ahead.start(trajectory, setting)
             self.screen.start(trajectory, setting)
         judge = self.judge()
         fitted = judge.fit(setting)
@@ -94,9 +91,9 @@ class Identification:
         columns = Columns(
             self.screen, setting, self.usual, every, seen=self.seen, few=True, curves=curves
         )
-        nominal = squares(self.screen, columns.residual if not setting else None)
-        columns.secants(Evidence(self.screen, columns.residual, columns.array, nominal))
-        evidence = Evidence(self.screen, columns.residual, columns.array, nominal)
+        nominal = squares(self.screen)
+        columns.secants(columns.evidence(nominal))
+        evidence = columns.evidence(nominal)
         beam = Beam(columns, evidence)
         start, nodes = beam.nodes()
         self.log(
@@ -104,18 +101,16 @@ class Identification:
         )
         judge = self.judge()
         now = judge.fit(setting)
-        now, by = self.begun_anew(judge, now) if setting else (now, judge)
-        judged = {now: by}
+        judged = [now]
         number = len(every) + len(curves)
         for node in self._finalists(beam, start, nodes, number):
-            fitted, by = self.begun_anew(judge, judge.fit(beam.setting(node), steps=3))
+            fitted = judge.fit(beam.setting(node), steps=3)
             p = paired(now.score, fitted.score).p_value
             losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
             self.log(f"  {losses} {'' if fitted.settled else '(limit) '}{said(fitted.setting)}")
-            judged[fitted] = by
-        best = self._choose(list(judged), now, number)
+            judged.append(fitted)
+        best = self._choose(judged, now, number)
         if best is not now:
-            judge = judged[best]
             best = self.pruned(judge, judge.fit(best.setting))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         better = best.setting.keys() != setting.keys()
@@ -130,19 +125,6 @@ class Identification:
         taken = {self.world.model.joint(j).name for some in joints for j in some}
         found = [d for d in found if d.variables != (f"velocity:{d.joint}",)]
         return [(d.candidate, d.values) for d in found if d.joint not in taken][:CURVES]
-
-    def begun_anew(self, judge, fitted):
-        """(Fitted again, its Judge) from the start states that the recordings have under a set: of
-        a poor model's motion they are too uncertain to tell a good one."""
-        smoother, trajectory, ahead = copy(self.smoother), self.trajectory, copy(judge.ahead)
-        again = Judge(ahead, self.usual, judge.reference, self.seen)
-        for k in range(ANEW):
-            trajectory = smoother.locate(fitted.setting, trajectory, passes=1, near=k > 0)
-            ahead.start(trajectory)
-            before, fitted = fitted, again.fit(fitted.setting, steps=2)
-            if k and fitted.loss > before.loss - STAYS:
-                break
-        return fitted, again
 
     @staticmethod
     def _finalists(beam, start, nodes, number):
@@ -207,10 +189,9 @@ class Identification:
         return list(best.values())
 
 
-def squares(ahead, residual=None):
-    """Mean squared errors (groups, cells) of an Ahead's residual (W, T, nv), by default that of the
-    nominal model."""
-    residual = ahead.residual([{}])[0] if residual is None else residual
+def squares(ahead):
+    """Mean squared errors (groups, cells) of the nominal model in the windows of an Ahead."""
+    residual = ahead.residual([{}])[0]
     return Evidence(ahead, residual, np.zeros((*residual.shape, 0))).reference
 
 

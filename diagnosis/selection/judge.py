@@ -54,7 +54,7 @@ class Judge:
         setting, residual = {c: self._inside(c, v) for c, v in setting.items()}, None
         for left in range(steps, -1, -1):
             columns = Columns(self.ahead, setting, self.usual, list(setting), residual, self.seen)
-            evidence = Evidence(self.ahead, columns.residual, columns.array, self.reference)
+            evidence = columns.evidence(self.reference)
             index, low, high, precision, pull = problem(columns, range(len(columns.options)))
             score = evidence.score(index, low, high, precision, pull)
             better = self._lower(columns, evidence, score.amounts, setting) if left else None

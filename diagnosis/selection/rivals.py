@@ -1,7 +1,7 @@
 """What could stand in a finding's place: effects whose refits predict as well, told as a class, the
 best for its price first.
 
-fitted, others = classes(candidates, judge, chain, fitted, anew)
+fitted, others = classes(candidates, judge, chain, fitted)
 others[candidate]                                    # [(other, values), ...]
 """
 
@@ -20,10 +20,9 @@ FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
-def classes(candidates, judge, chain, fitted, anew, log=lambda what: None):
+def classes(candidates, judge, chain, fitted, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
-    its price, and the other members. Among equals the finding stays. anew(judge, fitted): (Fitted,
-    its Judge), from the start states under its own set."""
+    its price, and the other members. Among equals the finding stays."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting:
@@ -40,7 +39,7 @@ def classes(candidates, judge, chain, fitted, anew, log=lambda what: None):
         others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
         told = {o for o, _ in others[own]}
         pool = [c for c in candidates if c not in told and c not in fitted.setting]
-        others[own] += _late(pool, judge, chain, fitted, own, anew)
+        others[own] += _late(pool, judge, chain, fitted, own)
     others = {c: each[:MOST] for c, each in others.items() if c in fitted.setting}
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
@@ -59,7 +58,7 @@ def _members(candidates, judge, chain, fitted, candidate):
     return sorted(out, key=lambda pair: pair[0].loss)
 
 
-def _late(pool, judge, chain, fitted, candidate, anew):
+def _late(pool, judge, chain, fitted, candidate):
     """[(other, values)] of a delay in the drive for one in the sensor, or the other way round, that
     predict as well: both begin at states of their own, for a late sensor shows others."""
     world = chain.world
@@ -71,11 +70,10 @@ def _late(pool, judge, chain, fitted, candidate, anew):
     if not near or not world.joints(candidate.place):
         return []
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    begun, out = anew(judge, fitted)[0], []
+    out = []
     for other in near:
-        tried = judge.fit({**rest, other: fitted.setting[candidate]}, steps=0)
-        tried = anew(judge, tried)[0]
-        if tried.settled and _tied(tried, begun):
+        tried = judge.fit({**rest, other: fitted.setting[candidate]})
+        if tried.settled and _tied(tried, fitted):
             out.append((other, tried.setting[other]))
     return out
 
@@ -135,10 +133,10 @@ def _near(world, candidate, pool):
 
 def _left(evidence, columns):
     """Weighted squares that columns leave of what is gone."""
-    index = np.concatenate([[0], np.asarray(columns, int) + 1]).astype(int)
-    weight = evidence.weight(np.array([0]), np.zeros(0))
-    whole = np.einsum("gc,gcij->ij", weight, evidence.products(index))
-    if len(index) == 1:
+    none = np.zeros(0)
+    weight = evidence.weight(evidence.freed((), none), none)
+    whole = np.einsum("gc,gcij->ij", weight, evidence.freed(columns, np.zeros(len(columns))))
+    if not len(columns):
         return whole[0, 0]
     inside = whole[1:, 1:] + 1e-9 * np.diag(np.diag(whole)[1:])
     return whole[0, 0] - whole[0, 1:] @ np.linalg.solve(inside, whole[1:, 0])

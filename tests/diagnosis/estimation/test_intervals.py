@@ -11,11 +11,11 @@ from diagnosis.estimation.intervals import half_widths
 
 def fitted(ahead, residual, columns):
     """(values, half widths): columns' amounts refitted until nothing moves, as a judge does."""
-    every = np.arange(columns.shape[-1] + 1)
-    values = np.zeros(len(every) - 1)
+    every = np.arange(columns.shape[-1])
+    values = np.zeros(len(every))
     for _ in range(4):
         evidence = evidence_of(ahead, residual - columns @ values, columns)
-        values = values + free(evidence, every[:-1]).amounts
+        values = values + free(evidence, every).amounts
     half, moves = half_widths(evidence_of(ahead, residual - columns @ values, columns), every)
     return values + moves, half
 
@@ -58,7 +58,7 @@ def test_what_others_do_as_well_has_no_interval():
     rng, ahead = np.random.default_rng(2), scene()
     column = clustered(rng, ahead, (1,))
     three = np.concatenate([column, 2 * column, clustered(rng, ahead, (1,))], -1)
-    half, _ = half_widths(evidence_of(ahead, clustered(rng, ahead), three), np.arange(4))
+    half, _ = half_widths(evidence_of(ahead, clustered(rng, ahead), three), np.arange(3))
     assert np.isinf(half[:2]).all() and np.isfinite(half[2])
 
 

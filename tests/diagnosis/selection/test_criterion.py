@@ -96,7 +96,7 @@ def test_what_is_within_the_noise_decides_nothing():
     rng, ahead = np.random.default_rng(6), scene(noise=1.0)
     column = rng.normal(size=(*ahead.known.shape, 1))
     evidence = evidence_of(ahead, 0.9 * column[..., 0], column)
-    assert evidence._square(evidence.products(np.array([0, 1])), np.ones(1)).max() < 0.02
+    assert evidence.squares((0,), np.ones(1)).max() < 0.02
     assert abs(free(evidence, (0,)).loss) < 1e-9
 
 
@@ -113,8 +113,7 @@ def test_what_shows_in_few_groups_is_worth_as_much_and_breaking_others_costs():
     assert -good.loss == pytest.approx(np.log(10), abs=0.2)
     assert paired(free(evidence, ()), good).p_value < 1e-3
     both = evidence_of(ahead, noise + 10 * mends[..., 0], shakes)
-    index = np.array([0, 1])
-    square = both._square(both.products(index), np.array([10.0]))
+    square = both.squares((0,), np.array([10.0]))
     assert both._scored(square, ()).loss > 1.0
 
 
@@ -130,14 +129,72 @@ def test_effects_that_do_the_same_tie():
     assert paired(one, both).p_value > 0.01
 
 
-def test_a_first_look_is_the_gain_of_least_squares():
-    rng, ahead = np.random.default_rng(5), scene(channels=2)
+def begun(rng, windows=48, rows=20):
+    """Of two components of a start state: where it is, and where it goes to, (W, rows, 1, 2)."""
+    one = np.stack([np.ones(rows), np.arange(rows) / 10], -1)[None, :, None]
+    return one * rng.uniform(0.5, 2.0, (windows, 1, 1, 2))
+
+
+def without_starts(ahead, evidence, given, amounts):
+    """(residual, columns) less what start states follow of them, by penalised least squares of
+    each window alone, its rows weighted as INDEPENDENT errors of the size that evidence tells."""
+    residual, columns = given
+    error = evidence.squares(range(len(amounts)), amounts) + evidence.floor
+    out = [np.array(residual), np.array(columns)]
+    for w, S in enumerate(ahead.freedom()):
+        m, root = S.shape[-1], np.sqrt(INDEPENDENT / len(S) / error[ahead.group[w]])
+        design = np.concatenate([root * S[:, 0], np.eye(m)])
+        for each in out:
+            flat = each[w].reshape(len(S), -1)
+            target = np.concatenate([root * flat, np.zeros((m, flat.shape[1]))])
+            moved = np.linalg.lstsq(design, target, rcond=None)[0]
+            each[w] -= (S[:, 0] @ moved).reshape(each[w].shape)
+    return out
+
+
+def test_start_states_are_free_within_what_is_known_of_them():
+    """Windows begin beside the motion by up to three deviations; a column explains the rest."""
+    rng = np.random.default_rng(8)
+    S = 0.3 * begun(rng)  # five noises
+    ahead = scene(noise=0.1, begun=S)
+    moved = rng.normal(size=(48, 1, 1, 2))
+    column = rng.normal(size=(*ahead.known.shape, 1))
+    noise = 0.1 * rng.normal(size=ahead.known.shape)
+    residual = noise + (S * moved).sum(-1) + column[..., 0]
+    score = free(evidence_of(ahead, residual, column), (0,))
+    assert score.amounts[0] == pytest.approx(1.0, abs=0.02)
+    evidence = evidence_of(ahead, residual, column)
+    assert np.sqrt(evidence.squares((0,), np.ones(1)).mean()) == pytest.approx(0.1, abs=0.02)
+    left, _ = without_starts(ahead, evidence, (noise + (S * moved).sum(-1), column), np.ones(1))
+    own = np.array([np.mean(left[ahead.group == g] ** 2) for g in range(16)])
+    np.testing.assert_allclose(evidence.squares((0,), np.ones(1))[:, 0], own, rtol=0.02)
+    certain = evidence_of(scene(noise=0.1), residual, column).squares((0,), np.ones(1))
+    assert np.sqrt(certain.mean()) > 0.3  # where starts are certain, their error stays
+
+
+def test_start_states_do_not_follow_what_is_far_beyond_what_is_known_of_them():
+    """An error of thirty deviations is no matter of the start."""
+    rng = np.random.default_rng(9)
+    S = 0.01 * begun(rng)
+    ahead = scene(noise=1e-3, begun=S)
+    residual = 30 * S.sum(-1)
+    square = evidence_of(ahead, residual, np.zeros((*residual.shape, 0))).reference
+    assert np.sqrt(square.mean() / np.mean(residual**2)) > 0.3
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_first_look_is_the_gain_of_least_squares(moves):
+    rng = np.random.default_rng(5)
+    ahead = scene(channels=1 if moves else 2, begun=begun(rng) if moves else None)
     columns, residual = clustered(rng, ahead, (4,)), clustered(rng, ahead)
     evidence = evidence_of(ahead, residual, columns)
     start = free(evidence, (1,))
     gains = evidence.looks((1,), start.amounts, np.zeros(1))
-    weight = evidence.weight(np.array([0, 2]), start.amounts)
+    weight = evidence.weight(evidence.freed((1,), start.amounts), start.amounts)
     rows = np.sqrt(weight[ahead.group])[:, None, :] * np.ones(ahead.known.shape)
+    if moves:
+        every = np.array([0.0, start.amounts[0], 0.0, 0.0])
+        residual, columns = without_starts(ahead, evidence, (residual, columns), every)
     y, x = (rows * residual).ravel(), (rows[..., None] * columns).reshape(-1, 4)
     left = lambda keep: np.sum(
         (y - x[:, keep] @ np.linalg.lstsq(x[:, keep], y, rcond=None)[0]) ** 2

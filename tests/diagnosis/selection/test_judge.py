@@ -101,7 +101,7 @@ def test_back_emf_and_viscous_damping_are_one_class():
     pool = [c for c in world.candidates if c.effect.name in names]
     for found in (damping, back_emf):
         fitted = judge.fit({found: (0.1,)})
-        again, others = rivals.classes(pool, judge, along(judge), fitted, None)
+        again, others = rivals.classes(pool, judge, along(judge), fitted)
         [named] = again.setting
         told = {named, *(c for c, _ in others[named])}
         assert {damping, back_emf} <= told
@@ -118,7 +118,7 @@ def test_what_is_no_equal_is_not_told():
     fitted = judge.fit({friction: (0.05,)})
     others = "gain", "stiffness", "mass", "delay", "viscous_damping", "gravity", "bias"
     pool = [c for c in world.candidates if c.effect.name in others]
-    again, told = rivals.classes(pool, judge, along(judge), fitted, None)
+    again, told = rivals.classes(pool, judge, along(judge), fitted)
     assert list(again.setting) == [friction]
     assert told[friction] == []
 
@@ -144,26 +144,26 @@ def test_a_step_is_taken_as_far_as_it_lowers_the_loss(monkeypatch, losses, taken
     assert (found and found[0]) == taken
 
 
-def test_a_late_sensor_is_told_beside_a_late_drive_each_from_its_own_start_states():
+def test_a_late_sensor_is_told_beside_a_late_drive():
     judge = judge_of()
     world, asked = judge.ahead.world, []
     delay, late = world.candidate("delay", "drive"), world.candidate("sensor_delay", "pivot")
-    fitted = judge.fit({delay: (0.01,)}, steps=0)
 
-    def anew(by, set_of_one):
-        [c] = set_of_one.setting
+    def fit(setting):
+        [c] = setting
         asked.append(c)
         groups = losses[c] + np.linspace(-1e-6, 1e-6, 4) * len(repr(c))  # no chance at all
         return SimpleNamespace(
-            setting={c: (0.01,)}, settled=True, score=Score(losses[c], groups, 4 * groups, ())
-        ), by
+            setting=setting, settled=True, score=Score(losses[c], groups, 4 * groups, ())
+        )
 
-    chain = SimpleNamespace(world=world)
+    some = world.candidates, SimpleNamespace(fit=fit), SimpleNamespace(world=world)
     losses = {delay: -1.0, late: -0.95}
-    assert rivals._late(world.candidates, judge, chain, fitted, delay, anew) == [(late, (0.01,))]
+    fitted = fit({delay: (0.01,)})
+    assert rivals._late(*some, fitted, delay) == [(late, (0.01,))]
     assert asked == [delay, late]
     losses = {delay: -1.0, late: -0.8}
-    assert rivals._late(world.candidates, judge, chain, fitted, delay, anew) == []
+    assert rivals._late(*some, fitted, delay) == []
     friction = judge.fit({world.candidate("coulomb_friction", "pivot"): (0.01,)}, steps=0)
     [named] = friction.setting
-    assert rivals._late(world.candidates, judge, chain, friction, named, anew) == []
+    assert rivals._late(*some, friction, named) == []

@@ -41,7 +41,7 @@ def chosen(monkeypatch, fitted, losses):
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
     monkeypatch.setattr(rivals, "_late", lambda *args: [])
     start = Judge().fit({names[fitted]: (2.0,)})
-    found, told = rivals.classes([DRY, CURVED], Judge(), None, start, None)
+    found, told = rivals.classes([DRY, CURVED], Judge(), None, start)
     return [c.name for c in found.setting], {
         c.name: [o.name for o, _ in each] for c, each in told.items()
     }

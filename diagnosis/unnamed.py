@@ -1,0 +1,134 @@
+"""What no name earns: a force that is missing, told as `unknown`, at its joint and with what it
+depends on.
+
+findings = led(world, outcome, findings, something)
+
+A name stands first only where the error of its joint goes with it. Where most of that is left,
+`unknown` leads, and the name is one of those that it may be.
+"""
+
+import numpy as np
+
+from diagnosis.effects.base import HINGE, SLIDE
+from diagnosis.selection.criterion import BEYOND
+from diagnosis.selection.plausibility import at_limit, plausible
+
+NEAREST, INSTEAD = 0.25, 0.5  # of a joint's error, that names leave: the nearest only, or none
+MOST = 3  # names that an unknown force may have
+
+
+def sizes(trajectory, dofs):
+    """(RMS of the force located in dofs (n,), how far it scatters), where nothing touches."""
+    rows = ~trajectory.free
+    if not rows.any():
+        return np.zeros(len(dofs)), np.ones(len(dofs))
+    force, deviation = trajectory.force[rows][:, dofs], trajectory.force_sd[rows][:, dofs]
+    return np.sqrt(np.mean(force**2, 0)), np.sqrt(np.mean(deviation**2, 0))
+
+
+def left(fitted):
+    """Share (n,) of the error beyond the noise that a Fitted set leaves in each channel, start
+    states free; NaN where the nominal model errs by no more than the noise."""
+    evidence = fitted.evidence
+    noise = np.where(evidence.count > 0, evidence.noise**2, np.inf)
+    excess = []
+    for square in (evidence.reference, evidence.squares((), np.zeros(0))):
+        beyond = np.maximum(square - noise, 0.0).reshape(len(square), evidence.channels, -1)
+        excess.append(beyond.sum((0, 2)))
+    told = (evidence.reference > BEYOND**2 * noise).reshape(len(noise), evidence.channels, -1)
+    return np.sqrt(excess[1] / np.where(told.any((0, 2)), excess[0], np.nan))
+
+
+def main_joint(world, outcome, candidate):
+    """(joint, share of its error that is left) of the joint in which a finding acts and most force
+    is missing; (None, NaN) where it has no such place."""
+    joints = world.joints(candidate.place) or ()
+    joints = sorted(j for j in joints if world.model.jnt_type[j] in (HINGE, SLIDE))
+    if not joints:
+        return None, np.nan
+    dofs = world.model.jnt_dofadr[joints]
+    force, scatter = sizes(outcome.found.first, dofs)
+    k = int(np.argmax(force / scatter))
+    channel = [dofs[k] in some for some in outcome.fitted.columns.ahead.channels].index(True)
+    return world.model.joint(joints[k]).name, float(left(outcome.fitted)[channel])
+
+
+def missing_most(world, outcome):
+    """The joint whose missing force stands out most, or None where none does."""
+    joints = np.flatnonzero(np.isin(world.model.jnt_type, (HINGE, SLIDE)))
+    if not len(joints):
+        return None
+    force, scatter = sizes(outcome.found.first, world.model.jnt_dofadr[joints])
+    k = int(np.argmax(force / scatter))
+    return world.model.joint(joints[k]).name if force[k] > BEYOND * scatter[k] else None
+
+
+def unknown(joint, outcome):
+    """The finding of a force at a joint, without a name and without a curve."""
+    on = next((d.variables for d in outcome.dependences if d.joint == joint), ())
+    return {
+        "effect": "unknown",
+        "place": {"kind": "joint", "name": joint},
+        "parameters": [],
+        "evidence": {"held_out_error_removed": 0.0, "p_value": None},
+        "adequate": False,
+        "strains": None,
+        "depends_on": list(on),
+        "when": None,
+        "written_as": "none",
+        "also_possible": [],
+    }
+
+
+def beside(finding, name):
+    """A finding of an unknown force, with a name that it may have and that is written in its
+    place."""
+    other = {key: name[key] for key in ("effect", "place", "parameters")}
+    evidence, more = finding["evidence"], name["evidence"]
+    removed = evidence["held_out_error_removed"] + more["held_out_error_removed"]
+    p = min((x["p_value"] for x in (evidence, more) if x["p_value"] is not None), default=None)
+    written = finding["written_as"]
+    return {
+        **finding,
+        "evidence": {**evidence, "held_out_error_removed": removed, "p_value": p},
+        "written_as": name["written_as"] if written == "none" else written,
+        "also_possible": [*finding["also_possible"], other][:MOST],
+    }
+
+
+def _at_edge(outcome, candidate):
+    """Whether a value lies at the edge of what was tried: the truth may lie anywhere beyond."""
+    values = outcome.fitted.setting[candidate]
+    return at_limit(candidate, values, plausible(candidate, outcome.found.usual))
+
+
+def led(world, outcome, findings, something):
+    """Findings with `unknown` in the place of names that leave most of the error of their joint or
+    have a value at the edge of what was tried, or where something is missing and nothing has a
+    name.
+
+    findings: [(candidate or None, finding)], the most important first.
+    """
+    leads = {f["place"]["name"]: f for _, f in findings if f["effect"] == "unknown"}
+    order = []  # findings, and the joints of unknown forces
+    for candidate, finding in findings:
+        joint = finding["place"]["name"] if finding["effect"] == "unknown" else None
+        if candidate and joint is None:
+            at, share = main_joint(world, outcome, candidate)
+            told = share if np.isfinite(share) else None
+            finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
+            edge = _at_edge(outcome, candidate)
+            if at and (share > INSTEAD or edge):
+                joint = at
+                leads[joint] = beside(leads.get(joint) or unknown(joint, outcome), finding)
+            elif share > NEAREST or edge:
+                on = next((d.variables for d in outcome.left if d.joint == at), ())
+                finding |= {"adequate": False, "rest_depends_on": list(on)}
+        if joint is None:
+            order.append(finding)
+        elif joint not in order:
+            order.append(joint)
+    joint = missing_most(world, outcome) if something and not order else None
+    if joint is not None:
+        order, leads = [joint], {joint: unknown(joint, outcome)}
+    return [leads[each] if isinstance(each, str) else each for each in order]

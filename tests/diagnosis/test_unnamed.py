@@ -1,0 +1,133 @@
+"""Names stand first only where the error of their joint goes with them."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from arm import ARM, run
+
+from diagnosis import unnamed
+from diagnosis.recordings.recording import Recording
+from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.simulation.simulator import World
+
+WORLD = World(mujoco.MjSpec.from_string(ARM))
+FRICTION, STIFFNESS, MASS = (
+    WORLD.candidate(*c)
+    for c in (("coulomb_friction", "elbow"), ("stiffness", "elbow"), ("mass", "lower"))
+)
+
+TABLE = run()
+RUN = Recording("run.csv", TABLE[:, 0], TABLE[:, 1:3], TABLE[:, 3:5], TABLE[:, 5:])
+USUAL = Usual(WORLD, [RUN], np.ones(2))
+
+
+def smoothed(elbow, shoulder=0.0, scatter=0.1):
+    """A trajectory with forces of these RMS values at two joints, each known to the scatter."""
+    force = np.array([[shoulder, elbow], [-shoulder, -elbow]])
+    free = np.zeros(2, bool)
+    return SimpleNamespace(force=force, force_sd=np.full((2, 2), scatter), free=free)
+
+
+def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1):
+    """errors: of the elbow, before and after, in ten noises; the shoulder errs by none."""
+    dependences = [SimpleNamespace(joint=j, variables=v) for j, v in depends]
+    before, after = (np.array([[1.0, 1.0, 100 * e**2, 100 * e**2]]) for e in errors)
+    evidence = SimpleNamespace(
+        count=np.ones((1, 4)),
+        noise=np.ones(4),
+        channels=2,
+        reference=before,
+        squares=lambda columns, amounts: after,
+    )
+    ahead = SimpleNamespace(channels=[np.array([0]), np.array([1])])
+    setting = {FRICTION: (friction,), STIFFNESS: (0.1,), MASS: (0.3,)}
+    columns = SimpleNamespace(ahead=ahead)
+    fitted = SimpleNamespace(evidence=evidence, columns=columns, setting=setting)
+    found = SimpleNamespace(first=trajectory, usual=USUAL)
+    return SimpleNamespace(found=found, fitted=fitted, dependences=dependences, left=dependences)
+
+
+def finding(candidate, removed=0.4, p=1e-5, written="mjcf"):
+    return candidate, {
+        "effect": candidate.effect.name,
+        "place": {"kind": "joint", "name": candidate.place.name},
+        "parameters": [{"value": 0.1}],
+        "evidence": {"held_out_error_removed": removed, "p_value": p},
+        "adequate": True,
+        "depends_on": [],
+        "written_as": written,
+        "also_possible": [],
+    }
+
+
+DEPENDS = [("elbow", ("position:elbow", "velocity:elbow")), ("shoulder", ("time",))]
+
+
+@pytest.mark.parametrize(
+    "after, effect, adequate",
+    [
+        (0.1, "coulomb_friction", True),  # no more than the noise
+        (0.2, "coulomb_friction", True),
+        (0.4, "coulomb_friction", False),  # the nearest name
+        (0.7, "unknown", False),
+    ],
+)
+def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequate):
+    given = outcome(smoothed(1.0), (1.0, after), DEPENDS)
+    told = unnamed.led(WORLD, given, [finding(FRICTION)], True)
+    [only] = told
+    assert (only["effect"], only["adequate"]) == (effect, adequate)
+    if effect == "unknown":
+        assert only["place"]["name"] == "elbow" and only["written_as"] == "mjcf"
+        assert only["depends_on"] == ["position:elbow", "velocity:elbow"]
+        assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
+        assert only["evidence"]["held_out_error_removed"] == 0.4
+    elif not adequate:
+        assert only["rest_depends_on"] == ["position:elbow", "velocity:elbow"]
+
+
+def test_names_that_share_a_joint_are_one_unknown_force():
+    given = [finding(FRICTION), finding(STIFFNESS, removed=0.1, p=1e-9)]
+    told = unnamed.led(WORLD, outcome(smoothed(1.0), (1.0, 0.9), DEPENDS), given, True)
+    [only] = told
+    names = [o["effect"] for o in only["also_possible"]]
+    assert names == ["coulomb_friction", "stiffness"]
+    assert only["evidence"]["held_out_error_removed"] == 0.5
+    assert only["evidence"]["p_value"] == 1e-9
+
+
+def test_a_curve_that_was_found_leads_the_names_at_its_joint():
+    curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))
+    known = finding(curve, written="python")
+    known[1]["depends_on"] = ["position:elbow"]
+    given = [finding(FRICTION), known]
+    told = unnamed.led(WORLD, outcome(smoothed(1.0), (1.0, 0.9), DEPENDS), given, True)
+    [only] = told
+    assert only["depends_on"] == ["position:elbow"] and only["written_as"] == "python"
+    assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
+
+
+def test_where_nothing_has_a_name_the_joint_that_stands_out_is_told():
+    both = outcome(smoothed(0.3, shoulder=0.9), depends=DEPENDS)
+    [only] = unnamed.led(WORLD, both, [], True)
+    assert (only["effect"], only["place"]["name"]) == ("unknown", "shoulder")
+    assert only["depends_on"] == ["time"] and only["written_as"] == "none"
+    assert unnamed.led(WORLD, both, [], False) == []
+    scatter = outcome(smoothed(0.12))  # 1.2 of its deviation
+    assert unnamed.led(WORLD, scatter, [], True) == []
+
+
+def test_what_lies_within_the_noise_says_nothing_against_a_name():
+    [only] = unnamed.led(WORLD, outcome(smoothed(0.1), (0.1, 0.1)), [finding(MASS)], True)
+    assert only["effect"] == "mass" and only["adequate"]
+    assert only["evidence"]["error_left"] is None
+
+
+def test_a_value_at_the_edge_of_what_was_tried_is_no_name():
+    edge = plausible(FRICTION, USUAL).high[0]
+    given = outcome(smoothed(1.0), (1.0, 0.1), DEPENDS, friction=edge)
+    [only] = unnamed.led(WORLD, given, [finding(FRICTION)], True)
+    assert only["effect"] == "unknown"
+    assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
