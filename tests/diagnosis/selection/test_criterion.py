@@ -167,7 +167,7 @@ def test_start_states_are_free_within_what_is_known_of_them():
     assert np.sqrt(evidence.squares((0,), np.ones(1)).mean()) == pytest.approx(0.1, abs=0.02)
     left, _ = without_starts(ahead, evidence, (noise + (S * moved).sum(-1), column), np.ones(1))
     own = np.array([np.mean(left[ahead.group == g] ** 2) for g in range(16)])
-    np.testing.assert_allclose(evidence.squares((0,), np.ones(1))[:, 0], own, rtol=0.02)
+    np.testing.assert_allclose(evidence.squares((0,), np.ones(1))[:, 0], own, rtol=0.05)
     certain = evidence_of(scene(noise=0.1), residual, column).squares((0,), np.ones(1))
     assert np.sqrt(certain.mean()) > 0.3  # where starts are certain, their error stays
 
