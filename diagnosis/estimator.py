@@ -17,7 +17,7 @@ from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
 from diagnosis.selection.criterion import PRICE, complexity, paired
-from diagnosis.selection.identification import Found, Identification, no_chance
+from diagnosis.selection.identification import Found, Identification, changing, no_chance
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
 from diagnosis.unnamed import INSTEAD
@@ -78,6 +78,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     fitted, others = _classes(search, found, found.fitted, log, search.candidates)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
         fitted = search.pruned(found.judge, fitted)
+    fitted = changing(found.judge, fitted)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
     outcome.event, outcome.earned = event, bool(outcome.fitted.setting or event)

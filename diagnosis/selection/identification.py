@@ -189,6 +189,13 @@ class Identification:
         return list(best.values())
 
 
+def changing(judge, fitted):
+    """A Fitted set without the effects whose values became the nominal ones."""
+    same = [c for c, v in fitted.setting.items() if np.allclose(v, c.nominal, rtol=1e-6, atol=0)]
+    rest = {c: v for c, v in fitted.setting.items() if c not in same}
+    return judge.fit(rest, steps=0) if same else fitted
+
+
 def squares(ahead):
     """Mean squared errors (groups, cells) of the nominal model in the windows of an Ahead."""
     residual = ahead.residual([{}])[0]

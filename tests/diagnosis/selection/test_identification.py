@@ -87,3 +87,21 @@ def test_finalists_are_worth_their_price_or_no_chance_and_predict_differently(se
     more = node(noise - 0.7, 0.3, 0, 4)
     nodes = sorted([worth, dear, same, luck, more], key=lambda n: n.loss)
     assert Identification._finalists(beam, start, nodes, 10) == [more, worth, dear]
+
+
+def test_what_became_nominal_is_no_finding(search):
+    friction, stiffness = (
+        search.world.candidate(name, "elbow") for name in ("coulomb_friction", "stiffness")
+    )
+    asked = []
+
+    def fit(setting, steps):
+        asked.append((setting, steps))
+        return SimpleNamespace(setting=setting)
+
+    judge = SimpleNamespace(fit=fit)
+    both = SimpleNamespace(setting={friction: (0.1,), stiffness: stiffness.nominal})
+    assert identification.changing(judge, both).setting == {friction: (0.1,)}
+    assert asked == [({friction: (0.1,)}, 0)]
+    kept = SimpleNamespace(setting={friction: (0.1,)})
+    assert identification.changing(judge, kept) is kept and len(asked) == 1
