@@ -39,28 +39,33 @@ def left(fitted):
     return np.sqrt(excess[1] / np.where(told.any((0, 2)), excess[0], np.nan))
 
 
-def main_joint(world, outcome, candidate):
-    """(joint, share of its error that is left) of the joint in which a finding acts and most force
-    is missing; (None, NaN) where it has no such place."""
-    joints = world.joints(candidate.place) or ()
-    joints = sorted(j for j in joints if world.model.jnt_type[j] in (HINGE, SLIDE))
+def _standing_out(world, outcome, joints):
+    """(joint, its dof, its missing force in deviations) of the hinge or slide among joints whose
+    force stands out most; None where there is none."""
+    joints = [j for j in joints if world.model.jnt_type[j] in (HINGE, SLIDE)]
     if not joints:
-        return None, np.nan
+        return None
     dofs = world.model.jnt_dofadr[joints]
     force, scatter = sizes(outcome.found.first, dofs)
     k = int(np.argmax(force / scatter))
-    channel = [dofs[k] in some for some in outcome.fitted.columns.ahead.channels].index(True)
-    return world.model.joint(joints[k]).name, float(left(outcome.fitted)[channel])
+    return world.model.joint(joints[k]).name, int(dofs[k]), float(force[k] / scatter[k])
+
+
+def main_joint(world, outcome, candidate, shares):
+    """(joint, share of its error that is left) of the joint in which a finding acts and most force
+    is missing; (None, NaN) where it has no such place. shares: of the channels, see left()."""
+    found = _standing_out(world, outcome, sorted(world.joints(candidate.place) or ()))
+    if found is None:
+        return None, np.nan
+    joint, dof, _ = found
+    channel = [dof in dofs for dofs in outcome.fitted.columns.ahead.channels].index(True)
+    return joint, float(shares[channel])
 
 
 def missing_most(world, outcome):
     """The joint whose missing force stands out most, or None where none does."""
-    joints = np.flatnonzero(np.isin(world.model.jnt_type, (HINGE, SLIDE)))
-    if not len(joints):
-        return None
-    force, scatter = sizes(outcome.found.first, world.model.jnt_dofadr[joints])
-    k = int(np.argmax(force / scatter))
-    return world.model.joint(joints[k]).name if force[k] > BEYOND * scatter[k] else None
+    found = _standing_out(world, outcome, range(world.model.njnt))
+    return found[0] if found and found[2] > BEYOND else None
 
 
 def unknown(joint, outcome):
@@ -110,11 +115,11 @@ def led(world, outcome, findings, something):
     findings: [(candidate or None, finding)], the most important first.
     """
     leads = {f["place"]["name"]: f for _, f in findings if f["effect"] == "unknown"}
-    order = []  # findings, and the joints of unknown forces
+    order, shares = [], left(outcome.fitted)  # findings, and the joints of unknown forces
     for candidate, finding in findings:
         joint = finding["place"]["name"] if finding["effect"] == "unknown" else None
         if candidate and joint is None:
-            at, share = main_joint(world, outcome, candidate)
+            at, share = main_joint(world, outcome, candidate, shares)
             told = share if np.isfinite(share) else None
             finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
             edge = _at_edge(outcome, candidate)

@@ -56,11 +56,8 @@ class Ahead:
         self.noise, self.step = noise, self.model.opt.timestep
         self.travel = self._travel()
         self.qpos, self.qvel = windowing.recorded_starts(self.model, windows)
-        self.spread, self.base, self._freedom = (
-            np.zeros((len(windows), 2 * self.model.nv)),
-            {},
-            None,
-        )
+        self.spread = np.zeros((len(windows), 2 * self.model.nv))  # of start states
+        self.base, self._freedom = {}, None
 
     def _travel(self):
         start = self.measured[:, :1]

@@ -94,22 +94,12 @@ class Chain(Ahead):
         new = {frozenset(m.items()): m for m in more if m}
         new = {key: m for key, m in new.items() if key not in self.beyond}
         if new:
-            for rough in (True, False):  # but for the time step itself, at coarse ones
-                steps = {**self.coarse, **self.base} if rough else self.base
-                some = {k: m for k, m in new.items() if rough != self._steps(m)}
-                if some:
-                    first, *rest = self.whole.residual(
-                        [steps, *({**steps, **m} for m in some.values())]
-                    )
-                    self.beyond |= {key: both - first for key, both in zip(some, rest)}
+            every = [self.base, *({**self.base, **m} for m in new.values())]
+            first, *rest = self.whole.residual(every)
+            self.beyond |= {key: both - first for key, both in zip(new, rest)}
         for row, m in zip(out, more):
             if m:
                 row += self.beyond[frozenset(m.items())]
-
-    @staticmethod
-    def _steps(setting):
-        """Whether a setting has a time step of its own."""
-        return any(c.effect.name == "time_step" for c in setting)
 
     def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""

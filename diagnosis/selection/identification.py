@@ -91,7 +91,7 @@ class Identification:
         columns = Columns(
             self.screen, setting, self.usual, every, seen=self.seen, few=True, curves=curves
         )
-        nominal = squares(self.screen)
+        nominal = squares(self.screen, columns.residual if not setting else None)
         columns.secants(columns.evidence(nominal))
         evidence = columns.evidence(nominal)
         beam = Beam(columns, evidence)
@@ -196,9 +196,10 @@ def changing(judge, fitted):
     return judge.fit(rest, steps=0) if same else fitted
 
 
-def squares(ahead):
-    """Mean squared errors (groups, cells) of the nominal model in the windows of an Ahead."""
-    residual = ahead.residual([{}])[0]
+def squares(ahead, residual=None):
+    """Mean squared errors (groups, cells) of an Ahead's residual (W, T, nv), by default that of the
+    nominal model."""
+    residual = ahead.residual([{}])[0] if residual is None else residual
     return Evidence(ahead, residual, np.zeros((*residual.shape, 0))).reference
 
 
