@@ -31,7 +31,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "a name stands whatever it leaves": {"diagnosis.unnamed:INSTEAD": 2.0},
     "no correction for the number looked at": {"diagnosis.selection.identification:LEVEL": 1.0},
     "a beam of one": {"diagnosis.selection.beam:WIDTH": 1},
-    "no values at full size": {"diagnosis.selection.columns:LADDER": ()},
+    "no values at full size": {"diagnosis.selection.starts:LADDER": ()},
     "no second look at the values that suit": {"diagnosis.selection.columns:SECANTS": 0},
     "no classes": {"diagnosis.selection.rivals:ALIKE": 2.0},
     "no curves beside names": {"diagnosis.selection.unmodelled_force:LEAST": 2.0},
@@ -44,7 +44,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "any difference on kept-back recordings": {"diagnosis.handover:SCATTER": 0.0},
     "a force without a name is free": {"diagnosis.estimator:UNNAMED": 0},
     "no curves in the search": {"diagnosis.selection.identification:CURVES": 0},
-    "fewer starts": {"diagnosis.selection.columns:PROBES": 4},
+    "fewer starts": {"diagnosis.selection.starts:PROBES": 4},
     "one finalist": {"diagnosis.selection.identification:FINALISTS": 1},
     "one horizon": {"diagnosis.estimation.ahead:HORIZONS": (1.0,)},
 }

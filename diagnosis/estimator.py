@@ -62,12 +62,9 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         )
     search = Identification(world, train, say, log)
     found = search.run()
-    event = transients.happened(
-        world,
-        train,
-        [(found.fitted.setting, found.trajectory), ({}, found.first)],
-        found.smoother.position_noise,
-    )
+    looks = [(found.fitted.setting, found.trajectory), ({}, found.first)]
+    looks = looks if found.fitted.setting else looks[1:]
+    event = transients.happened(world, train, looks, found.smoother.position_noise)
     if event and not plausible(event.candidate, found.usual).inside(np.array(event.values)):
         event = None
     if event:  # what lasts is searched again where it was not disturbed
@@ -95,12 +92,11 @@ def _checked(search, found, fitted, others, log):
     trajectory = found.trajectory
     left = unmodelled_force.dependences(world, trajectory, train)
     for rest in left[:2]:
-        beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=2)
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         # where no name is found, all that is told are a joint and a variable
         units = complexity([rest.candidate]) if mine else UNNAMED
-        step = paired(fitted.score, beside.score)
-        if step.gain < PRICE * units or not no_chance(step, len(search.candidates)):
+        beside = _beside(search, judge, fitted, rest, PRICE * units)
+        if not beside:
             continue
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
         size = _force(found, trajectory, world, rest.joint)
@@ -109,6 +105,17 @@ def _checked(search, found, fitted, others, log):
         if rest.candidate in fitted.setting:
             break
     return Outcome(found, fitted, trajectory, others, {}, {}, left, dependences)
+
+
+def _beside(search, judge, fitted, rest, price):
+    """The Fitted set with a curve beside, or None where it does not earn its place: as it was
+    located, and then refitted."""
+    for steps in (0, 2):
+        beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=steps)
+        step = paired(fitted.score, beside.score)
+        if step.gain < price or not no_chance(step, len(search.candidates)):
+            return None
+    return beside
 
 
 def _classes(search, found, fitted, log, candidates):

@@ -91,7 +91,8 @@ class Check:
         """The windows, begun at the motion that is located under a setting: noise of start states
         as recorded moves a prediction by more than many an effect does, and so do those that
         another setting located."""
-        self.path = copy(self.smoother).locate(setting, self.path, passes=1 if self.path else 3)
+        near = self.path is not None
+        self.path = copy(self.smoother).locate(setting, self.path, passes=2 + (not near), near=near)
         path, begun = self.path, {}
         for r in self.recordings:
             rows = path.rows(r)
@@ -125,8 +126,8 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
     have decided. refit(setting, out): what is left without one, fitted again; told: the Check of
     the errors that are told."""
     nominal = Files.of(world, {})
-    before, nothing = check.squares(nominal, {}), check.scattered()
-    while True:
+    before, nothing = check.squares(nominal, {}) if setting else None, check.scattered()
+    while setting:
         files = Files.of(world, setting)
         after = check.squares(files, setting)
         rest = {o: {c: v for c, v in setting.items() if c is not o} for o in setting}
@@ -142,6 +143,7 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
             return Handed(setting, files, nominal, errors)
         log(f"  not handed over: {worst}: worse by {worse[worst]:.4g}, noise {nothing:.4g}")
         setting = refit(rest[worst], worst)
+    return Handed(setting, nominal, nominal, {})
 
 
 def _worse(squares, others):

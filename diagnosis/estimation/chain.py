@@ -24,7 +24,7 @@ class Chain(Ahead):
 
     def start(self, trajectory, setting=None):
         super().start(trajectory, setting)
-        self.trajectory, self.map = trajectory, None
+        self.trajectory, self.setting, self.map = trajectory, setting, None
         last = np.array([w.last - w.first for w in self.windows])
         first = trajectory.begin(self.windows)
         ahead = np.arange(self.known.shape[1])
@@ -43,6 +43,13 @@ class Chain(Ahead):
         self.whole = self._begun(self.windows)
         self.contacts = self._begun([self.windows[i] for i in self.touched])
         self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
+
+    def beginnings(self, number, seconds):
+        """A Chain of the first seconds of so many of the windows, evenly chosen."""
+        chosen = [self.windows[i] for i in windowing.evenly(len(self.windows), number)]
+        short = Chain(self.world, [windowing.beginning(w, seconds) for w in chosen], self.noise)
+        short.start(self.trajectory, self.setting)
+        return short
 
     def _begun(self, windows):
         if not windows:

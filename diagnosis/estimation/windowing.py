@@ -102,6 +102,13 @@ def consecutive(recording, horizon=HORIZON, first=0, end=None):
     return out or [Window(recording, start, len(time) - 1)]
 
 
+def beginning(window, seconds):
+    """The first seconds of a window, three rows at least where it has as many."""
+    time = window.recording.time[window.first : window.last + 1]
+    rows = int(np.searchsorted(time, time[0] + seconds * (1 + 1e-9), side="right")) - 1
+    return window._replace(last=min(window.last, window.first + max(rows, 3)))
+
+
 def recorded_starts(model, windows):
     """Start states as the error defines them: qpos (W, nq), qvel (W, nv)."""
     known = {r: states(model, r) for r in recordings_of(windows)}

@@ -67,7 +67,9 @@ class Beam:
                     if key in met:
                         continue
                     met[key] = new = self.node(options)
-                    if new.unpriced < node.unpriced - LEAST and not self._unnamed(k):
+                    # of two that make up for each other neither is better alone
+                    better = node is start or new.unpriced < node.unpriced - LEAST
+                    if better and not self._unnamed(k):
                         grown.append(new)
             if not grown:
                 break
@@ -108,12 +110,13 @@ class Beam:
         return [gain[list(o.columns)].sum() for o in self.columns.options]
 
     def _looks(self, node):
-        """Indices of the further options with most gain in a first look."""
-        gain = self.gains(node)
+        """Indices of the further options that promise most for their price in a first look."""
+        gain, number = self.gains(node), self.evidence.number
         taken = {self.columns.options[k].candidate for k in node.options}
-        each = {k: gain[k] for k in self.free if self.columns.options[k].candidate not in taken}
+        worth = lambda k: gain[k] / number - PRICE * complexity([self.columns.options[k].candidate])
+        free = [k for k in self.free if self.columns.options[k].candidate not in taken]
         best, seen = [], {}
-        for k in sorted(each, key=lambda k: -each[k]):
+        for k in sorted(free, key=worth, reverse=True):
             candidate = self.columns.options[k].candidate
             seen[candidate] = seen.get(candidate, 0) + 1
             if seen[candidate] <= 2 and not self._unnamed(k):  # starts of one candidate

@@ -201,9 +201,10 @@ class Evidence:
         groups = len(each) * (each / np.maximum(counting.sum(0), 1.0)).sum(1) / self.cells
         return Score(float(groups.mean()), groups, each.sum(1), amounts)
 
-    def plain(self):
-        """Mean log RMS over all groups, counted alike, summed over channels: what a fit lowers."""
-        square = self.squares((), np.zeros(0))
+    def plain(self, columns=(), amounts=np.zeros(0)):
+        """Mean log RMS over all groups, counted alike, summed over channels, at amounts (p,) of
+        columns (p,): what a fit lowers."""
+        square = self.squares(columns, amounts)
         log = np.where(self.count > 0, 0.5 * np.log(square + self.floor), 0.0)
         return float(log.sum() / max((self.count > 0).sum(), 1) * self.channels)
 
@@ -217,20 +218,41 @@ class Evidence:
         amounts = np.zeros(len(columns))
         if not len(columns):
             return self._scored(self.squares((), amounts), amounts)
-        products, crossed = self._products(index), self.crossed[..., index]
-        g = np.tensordot(self.group.astype(float), products, 1)
-        for _ in range(ITERATIONS):
-            whole = np.einsum("gc,gcij->ij", self.weight(g, amounts), g)
-            amounts = bounded(whole[1:, 1:] + np.diag(precision), whole[1:, 0] + pull, low, high)
-            g = self._freed(products, crossed, self._square(g, amounts))
+        prior = np.diag(precision), pull, low, high
+        g, amounts = self._fitted(self._products(index), self.crossed[..., index], prior)
         each = np.einsum("gc,gcij->gij", self.weight(g, amounts), g)
         rest = each.sum(0) - each
         left = each_bounded(rest[:, 1:, 1:] + np.diag(precision), rest[:, 1:, 0] + pull, low, high)
         return self._scored(self._square(g, left), amounts)
 
+    def _fitted(self, products, crossed, prior):
+        """(products of the groups, start states free, amounts (p,)) of the lowest sum of logs.
+
+        That has several minima: in groups where the nominal model happens to do well, a fit that
+        begins at its errors would keep them. So it begins there, and where all groups weigh alike.
+        """
+        precision, pull, low, high = prior
+        nominal, best = np.tensordot(self.group.astype(float), products, 1), None
+        square = nominal[..., 0, 0] / np.maximum(self.count, 1)
+        alike = (square * self.count).sum(0) / np.maximum(self.count.sum(0), 1)
+        for begun in (square, np.broadcast_to(alike, square.shape)):
+            g = nominal
+            for _ in range(ITERATIONS):
+                whole = np.einsum("gc,gcij->ij", self._weighed(begun), g)
+                amounts = bounded(whole[1:, 1:] + precision, whole[1:, 0] + pull, low, high)
+                g = self._freed(products, crossed, self._square(g, amounts))
+                begun = self._square(g, amounts)
+            cost = amounts @ (precision @ amounts / 2 - pull)
+            loss = 0.5 * np.log(begun + self.floor)[self.count > 0].sum() + cost
+            if best is None or loss < best[0]:
+                best = loss, g, amounts
+        return best[1:]
+
     def weight(self, g, amounts):
         """(G, cells): weights of squares at which least squares lowers the sum of logs."""
-        square = self._square(g, amounts)
+        return self._weighed(self._square(g, amounts))
+
+    def _weighed(self, square):
         return np.where(
             self.count > 0, 1 / (np.maximum(self.count, 1) * (square + self.floor)), 0.0
         )

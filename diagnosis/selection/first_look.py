@@ -1,6 +1,7 @@
-"""A first look at every candidate: how much of what is missing it explains, a row ahead.
+"""A first look at every effect: how much of what is missing it explains, in a part of the
+motion.
 
-kept = likely(chain, setting, starts)     # the candidates that are worth a column in every row
+starts = likely(chain, setting, starts)     # those that are worth a column in every window
 
 It takes a tenth of the time of such columns.
 """
@@ -8,58 +9,89 @@ It takes a tenth of the time of such columns.
 import numpy as np
 
 from diagnosis.estimation import windowing
+from diagnosis.selection.beam import Beam
+from diagnosis.selection.columns import Columns
 
 ROWS = 300  # that are looked at, evenly chosen
+GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
 ODD = 5.0  # of its usual size, beyond which what is missing in a row counts no more
 LEAST = 0.05  # of its RMS, that its usual size is taken to be
 ROUNDS, EACH = 3, 12  # looks, beside the best of those before, and candidates that each keeps
 
 
 def likely(chain, setting, starts):
-    """Of the candidates of starts [(candidate, base, directions, ...)], those that explain most
-    alone, or beside the best: friction shows in a model with a wrong damping only beside that.
+    """Of Starts, the best ones of those candidates that explain most alone, or beside the best:
+    friction shows in a model with a wrong damping only beside that.
 
-    Kept is also what no row tells of: effects with states of their own or of the sensors, those
-    that change nothing in these rows or end in nothing finite; and everything, of a motion that
-    mostly touches something.
+    What acts within a row is asked a row ahead. Effects with states of their own or of the sensors
+    are asked in short windows, as is what changes nothing in the rows, and everything where the
+    motion mostly touches something. Kept are the effects of the setting as well.
     """
-    every = {start[0] for start in starts}
     free = chain.begin[~chain.trajectory.free[chain.begin]]
-    if 2 * len(free) < len(chain.begin):
-        return every
-    target, bases = _bases(chain, setting, starts, free[windowing.evenly(len(free), ROWS)])
-    kept, beside = every - {candidate for candidate, _ in bases}, np.zeros((len(target), 0))
-    for _ in range(ROUNDS):
-        best = {}
-        for candidate, basis in bases:
-            found = explained(np.concatenate([beside, basis], 1), target)
-            if found > best.get(candidate, (-1.0,))[0]:
-                best[candidate] = found, basis
-        ranked = sorted(best, key=lambda c: -best[c][0])
-        kept |= set(ranked[:EACH])
-        if ranked:
-            beside = np.concatenate([beside, best[ranked[0]][1]], 1)
-    return kept
+    touches = 2 * len(free) < len(chain.begin)
+    kept = [start for start in starts if start.candidate in setting]
+    new = [start for start in starts if start.candidate not in setting]
+    long = [start for start in new if touches or chain.apart(start.candidate)]
+    short = [start for start in new if start not in long]
+    some = []
+    if short:
+        target, bases = _bases(chain, setting, short, free[windowing.evenly(len(free), ROWS)])
+        long += [start for start in short if start not in bases]
+        some = _ahead(target, bases)
+    if long:
+        some += _glanced(chain.beginnings(*GLANCES), setting, kept, long)
+    return kept + some
+
+
+def _best(gains):
+    """Of {Start: gain}, [[Start, ...]] of the candidates that are kept, best first: of each the
+    best in proportion and the best of its whole values."""
+    best = {}
+    for start in sorted(gains, key=lambda start: -gains[start]):
+        best.setdefault(start.candidate, {}).setdefault(start.whole, start)
+    return [list(each.values()) for each in best.values()][:EACH]
+
+
+def _ahead(target, bases):
+    """The Starts whose bases explain most of a target (n,)."""
+    kept, beside = {}, np.zeros((len(target), 0))
+    for _ in range(ROUNDS if bases else 0):
+        both = {start: np.concatenate([beside, basis], 1) for start, basis in bases.items()}
+        best = _best({start: explained(basis, target) for start, basis in both.items()})
+        kept |= dict.fromkeys(sum(best, []))
+        beside = both[best[0][0]]
+    return list(kept)
+
+
+def _glanced(short, setting, inside, starts):
+    """The Starts that gain most in the windows of a short Chain, beside those inside a setting."""
+    columns = Columns(short, setting, inside + starts)
+    beam = Beam(columns, columns.evidence())
+    node, kept = beam.node(beam.kept), {}
+    for _ in range(ROUNDS if beam.free else 0):
+        gains = beam.gains(node)
+        best = _best({columns.begun[k]: gains[k] for k in beam.free})
+        kept |= dict.fromkeys(sum(best, []))
+        node = beam.node((*node.options, columns.begun.index(best[0][0])))
+    return list(kept)
 
 
 def _bases(chain, setting, starts, rows):
-    """(target (n,), [(candidate, basis (n, k))]): what is missing in some rows of all dofs, and how
+    """(target (n,), {Start: basis (n, k)}): what is missing in some rows of all dofs, and how
     starts change it."""
-    dofs, bases = chain.model.nv + np.flatnonzero(np.isfinite(chain.noise)), []
+    dofs, bases = chain.model.nv + np.flatnonzero(np.isfinite(chain.noise)), {}
     plain = chain.plain(setting)
     gap = chain.missing(plain, rows)[:, dofs]
     usable = np.isfinite(gap).all(1)
     rows, gap = rows[usable], gap[usable]
     size = 1.4826 * np.median(abs(gap), 0) + LEAST * np.sqrt(np.mean(gap**2, 0)) + 1e-12
     weight = 1 / np.maximum(size, abs(gap) / ODD)
-    for candidate, base, directions, *_ in starts:
-        if candidate in setting or chain.apart(candidate):
-            continue
-        settings = [{**plain, candidate: tuple(base + row)} for row in directions]
-        moved = [((gap - chain.missing(s, rows)[:, dofs]) * weight).ravel() for s in settings]
+    for start in starts:
+        changes = [gap - chain.missing(s, rows)[:, dofs] for s in start.settings(plain)]
+        moved = [(change * weight).ravel() for change in changes]
         basis = [m / abs(m).max() for m in moved if m.any()]
         if basis and np.isfinite(basis).all():
-            bases.append((candidate, np.stack(basis, 1)))
+            bases[start] = np.stack(basis, 1)
     return (gap * weight).ravel(), bases
 
 

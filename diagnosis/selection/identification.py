@@ -15,8 +15,10 @@ from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import LEAST, Beam
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
+from diagnosis.selection.first_look import likely
 from diagnosis.selection.judge import Fitted, Judge
 from diagnosis.selection.plausibility import Usual
+from diagnosis.selection.starts import Starts
 from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
@@ -66,7 +68,8 @@ class Identification:
             self.screen.start(trajectory, setting)
             self.trajectory = trajectory
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
-            fitted, better, look = self._round(setting)
+            judge = self.judge()
+            fitted, better, look = self._round(setting, judge)
             ranking = ranking or look
             if not better:
                 break
@@ -75,8 +78,8 @@ class Identification:
         else:  # rounds ended with a set from which nothing has begun
             self.ahead.start(trajectory, setting)
             self.screen.start(trajectory, setting)
-        judge = self.judge()
-        fitted = judge.fit(setting)
+            judge = self.judge()
+            fitted = judge.fit(setting)
         return Found(fitted, trajectory, first, smoother, self.usual, judge, self.screen, ranking)
 
     def judge(self):
@@ -84,13 +87,14 @@ class Identification:
         that misses."""
         return Judge(self.ahead, self.usual, squares(self.ahead), self.seen)
 
-    def _round(self, setting):
+    def _round(self, setting, judge):
         """(Fitted, whether it holds other effects than there were, first ranking)."""
         others = [c for c in self.candidates if c not in setting]
         every, curves = [*setting, *others], self._curves(setting)
-        columns = Columns(
-            self.screen, setting, self.usual, every, seen=self.seen, few=True, curves=curves
-        )
+        starts = Starts(self.world, setting, self.usual, self.seen, self.trajectory)
+        some = likely(self.screen, setting, starts.of(every))
+        some += [starts.curve(*curve) for curve in curves]
+        columns = Columns(self.screen, setting, some, seen=self.seen)
         nominal = squares(self.screen, columns.residual if not setting else None)
         columns.secants(columns.evidence(nominal))
         evidence = columns.evidence(nominal)
@@ -99,7 +103,6 @@ class Identification:
         self.log(
             f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}"
         )
-        judge = self.judge()
         now = judge.fit(setting)
         judged = [now]
         number = len(every) + len(curves)

@@ -12,6 +12,7 @@ import numpy as np
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import PRICE, Evidence, Score, complexity
 from diagnosis.selection.plausibility import at_limit, plausible, possible
+from diagnosis.selection.starts import Starts
 
 STEPS = 6  # Gauss-Newton steps of a refit, at most
 DONE = 2e-3  # loss that another step would still remove, from which on a refit is done
@@ -53,11 +54,14 @@ class Judge:
         """The Fitted values of a set of effects, begun at the values given."""
         setting, residual = {c: self._inside(c, v) for c, v in setting.items()}, None
         for left in range(steps, -1, -1):
-            columns = Columns(self.ahead, setting, self.usual, list(setting), residual, self.seen)
+            starts = Starts(self.ahead.world, setting, self.usual, self.seen).of(setting)
+            columns = Columns(self.ahead, setting, starts, residual, self.seen)
             evidence = columns.evidence(self.reference)
             index, low, high, precision, pull = problem(columns, range(len(columns.options)))
             score = evidence.score(index, low, high, precision, pull)
-            better = self._lower(columns, evidence, score.amounts, setting) if left else None
+            promised = evidence.plain() - evidence.plain(index, score.amounts)
+            worth = left and promised > DONE
+            better = self._lower(columns, evidence, score.amounts, setting) if worth else None
             if better is None:
                 break
             setting, residual = better

@@ -9,6 +9,8 @@ import numpy as np
 
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
+from diagnosis.selection.first_look import likely
+from diagnosis.selection.starts import Starts
 
 # cosine of two effects' columns beside the other findings', from which on one may stand for the
 # other
@@ -93,7 +95,8 @@ def _alike(judge, chain, fitted, candidate, pool):
     """
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     near = _near(chain.world, candidate, pool) + list(rest)
-    columns = Columns(chain, rest, judge.usual, near, few=True)
+    starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory).of(near)
+    columns = Columns(chain, rest, likely(chain, rest, starts))
     gone = columns.residual - chain.residual([fitted.setting])[0]
     evidence = Evidence(chain, gone, columns.array)
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]

@@ -6,7 +6,8 @@ import numpy as np
 from synthetic import clustered, evidence_of, scene
 
 from diagnosis.effects.unmodelled import Unknown
-from diagnosis.selection.beam import Beam
+from diagnosis.selection import beam as beam_module
+from diagnosis.selection.beam import LEAST, Beam
 from diagnosis.selection.columns import Option
 from diagnosis.selection.plausibility import Prior
 
@@ -31,7 +32,7 @@ def test_two_that_explain_all_are_met_beside_many_that_each_lower_squares_more()
     vague = Prior(np.zeros(1), np.full(1, np.inf), np.full(1, -9.0), np.full(1, 9.0))
     bounds = np.full(1, -9.0), np.full(1, 9.0)
     options = [
-        Option(every[name], np.zeros(1), np.ones((1, 1)), (k,), *bounds, vague)
+        Option(every[name], np.zeros(1), np.ones((1, 1)), *bounds, vague, columns=(k,))
         for k, (name, _) in enumerate(named)
     ]
     evidence = evidence_of(ahead, residual, columns)
@@ -52,7 +53,7 @@ def test_a_curve_is_met_alone_and_not_beside_others():
     vague = Prior(np.zeros(1), np.full(1, np.inf), np.full(1, -9.0), np.full(1, 9.0))
     bounds = np.full(1, -9.0), np.full(1, 9.0)
     options = [
-        Option(c, np.zeros(1), np.ones((1, 1)), (k,), *bounds, vague)
+        Option(c, np.zeros(1), np.ones((1, 1)), *bounds, vague, columns=(k,))
         for k, c in enumerate((curve, name))
     ]
     noise = 0.1 * clustered(rng, ahead, share=0.0)
@@ -62,3 +63,41 @@ def test_a_curve_is_met_alone_and_not_beside_others():
     )
     met = {frozenset(options[k].candidate.name for k in n.options) for n in beam.nodes()[1]}
     assert met == {frozenset(), frozenset({"curve"}), frozenset({"name"})}
+
+
+def made(named, residual, ahead, prices=()):
+    """A Beam over columns {name: column}, with what each is more than a first thing to think of."""
+    rows = enumerate(named)
+    vague = Prior(np.zeros(1), np.full(1, np.inf), np.full(1, -9.0), np.full(1, 9.0))
+    bounds = np.full(1, -9.0), np.full(1, 9.0)
+    options = [
+        Option(Named(n), np.zeros(1), np.ones((1, 1)), *bounds, vague, columns=(k,))
+        for k, n in rows
+    ]
+    for option, simplicity in zip(options, prices):
+        option.candidate.effect.simplicity = simplicity
+    columns = np.stack(list(named.values()), -1)
+    beam = Beam(SimpleNamespace(options=options, setting={}), evidence_of(ahead, residual, columns))
+    return beam, lambda node: {options[k].candidate.name for k in node.options}
+
+
+def test_two_that_make_up_for_each_other_are_met_where_neither_is_better_alone():
+    """As friction and a damping that was fitted without it."""
+    rng, ahead = np.random.default_rng(2), scene()
+    one, other, rest = (clustered(rng, ahead, share=0.0) for _ in range(3))
+    two = one + 0.05 * other
+    beam, names = made({"one": one, "two": two}, one - two + 0.001 * rest, ahead)
+    start, nodes = beam.nodes()
+    alone = [node for node in nodes if len(node.options) == 1]
+    assert min(node.unpriced for node in alone) > start.unpriced - LEAST
+    assert names(nodes[0]) == {"one", "two"}
+
+
+def test_of_options_that_promise_the_same_the_simplest_is_tried_first(monkeypatch):
+    monkeypatch.setattr(beam_module, "LOOKS", 1)
+    rng, ahead = np.random.default_rng(3), scene()
+    first, second = (clustered(rng, ahead, share=0.0) for _ in range(2))
+    named = {"first": first, "far": second, "near": 1.0 * second}
+    beam, names = made(named, first + 0.5 * second, ahead, prices=(0, 2, 1))
+    node = beam.node((0,))
+    assert [beam.columns.options[k].candidate.name for k in beam._looks(node)] == ["near"]

@@ -10,6 +10,7 @@ from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.selection.starts import Starts
 from diagnosis.simulation.simulator import World
 
 
@@ -23,6 +24,12 @@ def scene():
     ahead = Ahead(world, cut_ahead(runs), smoother.position_noise)
     ahead.start(trajectory)
     return world, ahead, Usual(world, runs, smoother.scale)
+
+
+def columns_of(scene, candidates):
+    """The Columns of all starts of candidates."""
+    world, ahead, usual = scene
+    return Columns(ahead, {}, Starts(world, {}, usual).of(candidates))
 
 
 def stock(ahead, window, damping=0.05, mass=0.5):
@@ -41,7 +48,7 @@ def stock(ahead, window, damping=0.05, mass=0.5):
 def test_a_column_is_what_the_prediction_gains_by_a_step_of_the_value(scene):
     world, ahead, usual = scene
     candidates = [world.candidate("viscous_damping", "pivot"), world.candidate("mass", "arm")]
-    columns = Columns(ahead, {}, usual, candidates)
+    columns = columns_of(scene, candidates)
     for name, moved in (("viscous_damping", "damping"), ("mass", "mass")):
         options = [o for o in columns.options if o.candidate.effect.name == name]
         option = min(options, key=lambda o: abs(o.directions).max())
@@ -59,7 +66,7 @@ def test_nothing_outside_its_bounds_is_offered(scene):
     candidates = [
         c for c in world.candidates if c.place.kind in ("joint", "actuator") and not c.effect.timed
     ]
-    columns = Columns(ahead, {}, usual, candidates)
+    columns = columns_of(scene, candidates)
     evidence = Evidence(ahead, columns.residual, columns.array)
     columns.secants(evidence)
     assert len(columns.options) > 15
@@ -75,7 +82,7 @@ def test_effects_that_show_nowhere_are_left_out(scene):
     world, ahead, usual = scene
     candidates = [world.candidate("ground_height", g) for g in ()]
     gravity = world.candidate("gravity", "world")
-    columns = Columns(ahead, {}, usual, candidates + [gravity])
+    columns = columns_of(scene, candidates + [gravity])
     sideways = [o for o in columns.options if (o.directions[:, 1] != 0).any()]
     assert not sideways  # the pendulum turns about y
 
@@ -83,7 +90,7 @@ def test_effects_that_show_nowhere_are_left_out(scene):
 def test_a_column_at_full_size_tells_friction_that_a_small_step_does_not(scene):
     world, ahead, usual = scene
     friction = world.candidate("coulomb_friction", "pivot")
-    columns = Columns(ahead, {}, usual, [friction])
+    columns = columns_of(scene, [friction])
     losses = {}
     evidence = Evidence(ahead, columns.residual, columns.array)
     for option in columns.options:
@@ -100,6 +107,6 @@ def test_amplitudes_are_begun_at_forces_that_the_machine_has(scene):
     for name in ("friction_map", "stribeck_friction", "presliding"):
         candidate = world.candidate(name, "pivot")
         prior = plausible(candidate, usual)
-        for option in Columns(ahead, {}, usual, [candidate]).options:
+        for option in columns_of(scene, [candidate]).options:
             begun = option.base[0] + option.directions[0, 0]
             assert begun == pytest.approx(0.1 * prior.scale[0]), name

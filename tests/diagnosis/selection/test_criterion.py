@@ -234,3 +234,19 @@ def test_what_is_farther_from_the_first_things_to_think_of_and_freer_is_more_com
     assert of("gain") < of("armature") < of("dead_zone") < of("stribeck_friction")
     assert of("stribeck_friction") < complexity([curve])
     assert complexity([curve]) == 8
+
+
+def test_a_fit_is_the_best_of_several_minima():
+    """Three groups in which the nominal model happens to be right hold a fit that begins at its
+    errors: of the sum of logs that is a minimum, not the least."""
+    rng, ahead = np.random.default_rng(0), scene()
+    column = clustered(rng, ahead, share=0.0)
+    right = (np.arange(16) < 3)[ahead.group][:, None, None]
+    left = np.where(right, 0.05, 0.3) * clustered(rng, ahead, share=0.0)
+    residual = np.where(right, 0.0, column) + left
+    evidence = evidence_of(ahead, residual, column[..., None])
+    square = lambda x: ((residual - x * column) ** 2).reshape(16, -1).mean(1)
+    tried = np.linspace(-0.5, 1.5, 401)
+    least = tried[np.argmin([np.log(square(x)).sum() for x in tried])]
+    assert least == pytest.approx(1.0, abs=0.05)
+    assert free(evidence, (0,)).amounts == pytest.approx([least], abs=0.01)

@@ -11,9 +11,9 @@ from diagnosis.estimation.ahead import cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection import first_look
-from diagnosis.selection.columns import Columns
 from diagnosis.selection.first_look import likely
-from diagnosis.selection.plausibility import Usual
+from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.selection.starts import Start, Starts
 from diagnosis.simulation.simulator import World
 
 
@@ -34,53 +34,94 @@ def located(damping, kept=0.05):
     return world, chain, Usual(world, runs, smoother.scale)
 
 
-def starts(world, *names):
+def starts(scene, *names):
     """Starts of candidates at a share of their scale."""
-    of = lambda c: (c, np.array(c.nominal, float), np.array([[0.05]]))
-    return [of(c) for c in world.candidates if c.effect.name in names]
+    world, _, usual = scene
+    bounds = np.full(1, -9.0), np.full(1, 9.0)
+    of = lambda c: (c, np.array(c.nominal, float), np.array([[0.05]]), *bounds)
+    chosen = [c for c in world.candidates if c.effect.name in names]
+    return [Start(*of(c), plausible(c, usual)) for c in chosen]
 
 
-def kept_of(chain, some, setting={}):
-    return {c.effect.name for c in likely(chain, setting, some)}
+def kept_of(scene, some, setting={}):
+    return {start.candidate.effect.name for start in likely(scene[1], setting, some)}
 
 
 def test_what_is_missing_is_kept_first(scene, monkeypatch):
-    world, chain, _ = scene
     monkeypatch.setattr(first_look, "EACH", 1)
     monkeypatch.setattr(first_look, "ROUNDS", 1)
-    some = starts(world, "coulomb_friction", "armature", "mass")
-    assert kept_of(chain, some) == {"coulomb_friction"}
-    # what the model has already is not judged
-    friction = {world.candidate("coulomb_friction", "pivot"): (0.1,)}
-    assert len(kept_of(chain, some, friction)) == 2
+    some = starts(scene, "coulomb_friction", "armature", "mass")
+    assert kept_of(scene, some) == {"coulomb_friction"}
+    # what the model has already stays
+    friction = {scene[0].candidate("coulomb_friction", "pivot"): (0.1,)}
+    assert len(kept_of(scene, some, friction)) == 2
 
 
 def test_what_shows_only_beside_the_best_is_kept(monkeypatch):
-    world, chain, _ = located(damping=0.09, kept=0.0)  # as a fit without dry friction has it
+    other = located(damping=0.09, kept=0.0)  # as a fit without dry friction has it
     monkeypatch.setattr(first_look, "EACH", 1)
-    some = starts(world, "coulomb_friction", "viscous_damping", "mass", "gain", "armature")
-    assert {"coulomb_friction", "viscous_damping"} <= kept_of(chain, some)
+    some = starts(other, "coulomb_friction", "viscous_damping", "mass", "gain", "armature")
+    assert {"coulomb_friction", "viscous_damping"} <= kept_of(other, some)
 
 
-def test_sensors_and_motions_that_mostly_touch_are_not_judged(scene, monkeypatch):
+def test_what_no_row_tells_is_asked_in_windows(scene, monkeypatch):
+    """A sensor's scale, and everything where the motion mostly touches something."""
     world, chain, _ = scene
-    monkeypatch.setattr(first_look, "EACH", 0)
-    assert kept_of(chain, starts(world, "sensor_scale", "mass")) == {"sensor_scale"}
+    monkeypatch.setattr(first_look, "EACH", 1)
+    monkeypatch.setattr(first_look, "ROUNDS", 1)
+    each = starts(scene, "sensor_scale", "sensor_bias", "coulomb_friction", "mass", "armature")
+    rows = {"coulomb_friction"}
+    kept = kept_of(scene, each)
+    assert rows < kept and kept - rows <= {"sensor_scale", "sensor_bias"}
     touching = Chain(world, chain.windows, chain.noise)
     touching.start(chain.trajectory)
     free = np.ones(len(chain.trajectory.free), bool)
     touching.trajectory = replace(chain.trajectory, free=free)
-    assert kept_of(touching, starts(world, "coulomb_friction")) == {"coulomb_friction"}
+    assert kept_of((world, touching, None), each) == {"coulomb_friction"}
 
 
-def test_few_columns_are_those_of_what_is_kept_and_of_the_setting(scene, monkeypatch):
+def test_what_changes_nothing_in_the_rows_is_asked_in_windows(scene, monkeypatch):
+    _, chain, _ = scene
+    some = starts(scene, "coulomb_friction", "mass")
+    asked = []
+    monkeypatch.setattr(chain, "missing", lambda setting, rows: np.ones((len(rows), 2)))
+    monkeypatch.setattr(first_look, "_glanced", lambda short, setting, kept, long: asked + long)
+    assert likely(chain, {}, some) == some
+
+
+def test_of_a_candidate_the_best_share_and_the_best_whole_value_are_kept(scene, monkeypatch):
+    monkeypatch.setattr(first_look, "ROUNDS", 1)
+    friction = starts(scene, "coulomb_friction")[0]
+    size = lambda x: replace(friction, directions=np.array([[x]]), low=np.array([0.3]))
+    tried = [friction, replace(friction, directions=np.array([[-0.9]])), size(0.1), size(3.0)]
+    target, bases = first_look._bases(scene[1], {}, tried, scene[1].begin[::20])
+    kept = first_look._ahead(target, bases)
+    assert len(kept) == 2 and kept.count(tried[2]) == 1
+    assert [start.whole for start in sorted(kept, key=lambda s: s.whole)] == [False, True]
+
+
+def test_a_look_at_all_starts_keeps_those_of_the_setting(scene, monkeypatch):
     world, chain, usual = scene
     monkeypatch.setattr(first_look, "EACH", 1)
-    monkeypatch.setattr(first_look, "ROUNDS", 1)
-    names = "coulomb_friction", "armature", "mass", "sensor_scale"
-    candidates = [c for c in world.candidates if c.effect.name in names]
-    few = Columns(chain, {}, usual, candidates, few=True)
-    assert {o.candidate.effect.name for o in few.options} == {"coulomb_friction", "sensor_scale"}
-    armature = next(c for c in candidates if c.effect.name == "armature")
-    some = Columns(chain, {armature: armature.nominal}, usual, candidates, few=True)
-    assert armature in {o.candidate for o in some.options}
+    armature = world.candidate("armature", "pivot")
+    friction = world.candidate("coulomb_friction", "pivot")
+    setting = {armature: armature.nominal}
+    every = Starts(world, setting, usual).of([armature, friction, world.candidate("mass", "arm")])
+    kept = {start.candidate for start in likely(chain, setting, every)}
+    assert {armature, friction} <= kept
+
+
+def test_beginnings_are_the_first_seconds_of_windows(scene):
+    short = scene[1].beginnings(4, 0.3)
+    assert len(short.windows) == 4
+    for w in short.windows:
+        time = w.recording.time
+        assert 0.28 < time[w.last] - time[w.first] <= 0.3 + 1e-9
+    gap = short.residual([{}])[0]
+    whole = scene[1].residual([{}])[0]
+    index = [
+        scene[1].windows.index(w)
+        for w in scene[1].windows
+        if w.first in [s.first for s in short.windows if s.recording is w.recording]
+    ]
+    np.testing.assert_allclose(gap, whole[index][:, : gap.shape[1]], atol=1e-12)

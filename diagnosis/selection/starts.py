@@ -1,0 +1,165 @@
+"""Where effects are begun: a small step where they act in proportion, whole values where they do
+not.
+
+starts = Starts(world, setting, usual).of(candidates)      # [Start]
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from diagnosis.estimation import windowing
+from diagnosis.selection.plausibility import plausible
+
+FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column stands for it
+PROBES = 12  # starts of one candidate that are looked at, but for those that come in groups
+LADDER = 0.1, 0.4  # shares of a prior's scale
+BEGUN = 0.1  # share of an amplitude's scale, at which effects of several values are begun
+STATES = 300  # of the motion, at which forces are compared
+PROMISING = 3  # groups of starts that are simulated
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A candidate begun at some values.
+
+    base (k,): its values in the setting; directions (p, k): change of the values per unit of each
+    of its p amounts; low, high (p,): bounds of the amounts; prior: a Prior; merges: whether its
+    amounts are worked out together, by the effect.
+    """
+
+    candidate: object
+    base: np.ndarray
+    directions: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    prior: object
+    merges: bool = False
+
+    @property
+    def whole(self):
+        """Whether these are whole values, of which no small share says anything."""
+        return bool((self.low > 0).any())
+
+    def settings(self, setting):
+        """A setting with each of the directions."""
+        return [{**setting, self.candidate: tuple(self.base + row)} for row in self.directions]
+
+
+class Starts:
+    """Where effects are begun beside a setting."""
+
+    def __init__(self, world, setting, usual, seen=None, trajectory=None):
+        """usual: a Usual; seen: {candidate: which of its parameters show}; trajectory: along which
+        starts that come in groups are compared with the located force, and few of them kept."""
+        self.world, self.setting, self.usual = world, setting, usual
+        self.seen, self.trajectory = seen or {}, trajectory
+
+    def of(self, candidates):
+        """[Start] of all the candidates."""
+        return [start for candidate in candidates for start in self._each(candidate)]
+
+    def _each(self, candidate):
+        world, recordings = self.world, self.usual.recordings
+        prior = plausible(candidate, self.usual)
+        inside = candidate in self.setting
+        base = np.array(self.setting.get(candidate, candidate.nominal), float)
+        if inside or not candidate.effect.overrides("probes"):
+            one = _proportional(candidate, base, prior, self.seen.get(candidate, True))
+            out = [one] if one else []
+            if inside:
+                return out
+            whole = list(world.far(candidate, recordings)) + _ladder(base, prior)
+        else:
+            out, whole = [], _begun(candidate, world.probes(candidate, recordings), prior)
+        together = candidate.effect.together
+        if together == 1 and len(whole) > PROBES:
+            whole = [whole[i] for i in windowing.evenly(len(whole), PROBES)]
+        elif together > 1 and self.trajectory is not None:
+            whole = self._promising(candidate, whole)
+        groups = [np.array(whole[k : k + together]) for k in range(0, len(whole), together)]
+        inside = [rows for rows in groups if all(prior.inside(row) for row in rows)]
+        return out + [_full(candidate, base, rows, prior) for rows in inside]
+
+    def curve(self, candidate, values):
+        """The Start of a force without a name at the values that were located."""
+        prior = plausible(candidate, self.usual)
+        return _full(candidate, np.zeros(len(values)), np.array([values]), prior)
+
+    def _promising(self, candidate, whole):
+        """Of starts that come in groups, those of the groups whose force is most like the located
+        one."""
+        t, world = self.trajectory, self.world
+        rows = np.flatnonzero(~t.free)
+        rows = rows[windowing.evenly(len(rows), STATES)]
+        if not len(rows):
+            return whole
+        engine = world.engine(frozenset([candidate])).working
+        zero = list(whole[0])
+        zero[0] = 0.0
+        forces = []
+        for values in [zero, *whole]:
+            model = engine.edited([(candidate, tuple(values))], world.model.opt.timestep)
+            forces.append(applied(model, t.qpos[rows], t.qvel[rows], engine))
+        none, *forces = forces
+        target, together, left = t.force[rows].ravel(), candidate.effect.together, []
+        for k in range(0, len(whole), together):
+            basis = np.stack([(f - none).ravel() for f in forces[k : k + together]], 1)
+            fit = np.linalg.lstsq(basis, target, rcond=None)[0]
+            left.append(np.sum((target - basis @ fit) ** 2))
+        best = sorted(np.argsort(left)[:PROMISING])
+        return [whole[k * together + i] for k in best for i in range(together)]
+
+
+def _full(candidate, base, rows, prior):
+    """The Start of a group of whole values (p, k)."""
+    finite, together = np.isfinite(base).all(), len(rows)
+    start = base if finite else np.zeros_like(base)
+    low, high = FULL if together == 1 else (-FULL[1], FULL[1])
+    if not finite:
+        low, high = 1.0, 1.0  # a limit that there was not: no share of it means anything
+    bounds = np.full(together, low), np.full(together, high)
+    return Start(candidate, start, rows - start, *bounds, prior, together > 1)
+
+
+def _begun(candidate, probes, prior):
+    """Starts of an effect, their amplitudes as large as the machine's forces let expect."""
+    n, rows = candidate.effect.amplitudes, np.array(probes, float)
+    if n and len(rows) and np.isfinite(prior.scale[0]) and len(set(rows[:, 0])) == 1:
+        rows[:, :n] *= BEGUN * prior.scale[0] / rows[0, 0]
+        rows = np.clip(rows, prior.low, prior.high)
+    return list(rows)
+
+
+def _ladder(base, prior):
+    """Full-size values of a parameter that only goes one way: what sticks or waits shows in no
+    small step."""
+    if len(base) > 1 or base[0] > prior.low[0] or not np.isfinite(prior.scale[0]):
+        return []
+    return [base + share * prior.scale for share in LADDER]
+
+
+def _proportional(candidate, base, prior, shown):
+    """The Start of small steps of the parameters that show, or None."""
+    steps = np.array([p.step for p in candidate.parameters])
+    steps = np.where((base + steps > prior.high) | ~np.isfinite(steps), -abs(steps), steps)
+    fits = (base + steps >= prior.low) & np.isfinite(base) & shown
+    if not fits.any():
+        return None
+    ends = np.stack([(prior.low - base) / steps, (prior.high - base) / steps])
+    low, high = ends.min(0)[fits], ends.max(0)[fits]
+    return Start(candidate, base, np.diag(steps)[fits], low, high, prior)
+
+
+def applied(model, qpos, qvel, working):
+    """Generalized forces of actuators and joints (n, nv) at states (n, nq), (n, nv) of the nominal
+    coordinates."""
+    data, out = mujoco.MjData(model), np.empty((len(qpos), qvel.shape[1]))
+    for row, q, v in zip(out, qpos, qvel):
+        data.qpos[working.q], data.qvel[working.v] = q, v
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_fwdActuation(model, data)
+        row[:] = (data.qfrc_actuator + data.qfrc_passive)[working.v]
+    return out
