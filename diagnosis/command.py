@@ -52,6 +52,7 @@ REFUSED = (  # what the user can mend
 )
 
 
+@quiet()
 def diagnose(
     model,
     recordings,
