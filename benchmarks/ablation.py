@@ -42,7 +42,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no coarse steps": {"diagnosis.simulation.rows:COARSER": 1.0},
     "whole steps only": {"diagnosis.selection.judge:THIRDS": 1},
     "any difference on kept-back recordings": {"diagnosis.handover:SCATTER": 0.0},
-    "a force without a name is free": {"diagnosis.estimator:UNNAMED": 0},
+    "a force without a name is free": {"diagnosis.unnamed:UNNAMED": 0},
     "no curves in the search": {"diagnosis.selection.identification:CURVES": 0},
     "fewer starts": {"diagnosis.selection.starts:PROBES": 4},
     "one finalist": {"diagnosis.selection.identification:FINALISTS": 1},

@@ -20,9 +20,8 @@ from diagnosis.selection.criterion import PRICE, complexity, paired
 from diagnosis.selection.identification import Found, Identification, changing, no_chance
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
-from diagnosis.unnamed import INSTEAD
+from diagnosis.unnamed import INSTEAD, UNNAMED
 
-UNNAMED = 2  # units of complexity of a force where nothing has a name
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 
 

@@ -10,10 +10,11 @@ A name stands first only where the error of its joint goes with it. Where most o
 import numpy as np
 
 from diagnosis.effects.base import HINGE, SLIDE
-from diagnosis.selection.criterion import BEYOND
+from diagnosis.selection.criterion import BEYOND, PRICE
 from diagnosis.selection.plausibility import at_limit, plausible
 
 NEAREST, INSTEAD = 0.25, 0.5  # of a joint's error, that names leave: the nearest only, or none
+UNNAMED = 2  # units of complexity of a force where nothing has a name
 MOST = 3  # names that an unknown force may have
 
 
@@ -40,32 +41,38 @@ def left(fitted):
 
 
 def _standing_out(world, outcome, joints):
-    """(joint, its dof, its missing force in deviations) of the hinge or slide among joints whose
-    force stands out most; None where there is none."""
+    """Name of the hinge or slide among joints whose missing force stands out most, in its own
+    deviations; None where there is none."""
     joints = [j for j in joints if world.model.jnt_type[j] in (HINGE, SLIDE)]
     if not joints:
         return None
     dofs = world.model.jnt_dofadr[joints]
     force, scatter = sizes(outcome.found.first, dofs)
-    k = int(np.argmax(force / scatter))
-    return world.model.joint(joints[k]).name, int(dofs[k]), float(force[k] / scatter[k])
+    return world.model.joint(joints[int(np.argmax(force / scatter))]).name
 
 
 def main_joint(world, outcome, candidate, shares):
     """(joint, share of its error that is left) of the joint in which a finding acts and most force
     is missing; (None, NaN) where it has no such place. shares: of the channels, see left()."""
-    found = _standing_out(world, outcome, sorted(world.joints(candidate.place) or ()))
-    if found is None:
+    joint = _standing_out(world, outcome, sorted(world.joints(candidate.place) or ()))
+    if joint is None:
         return None, np.nan
-    joint, dof, _ = found
-    channel = [dof in dofs for dofs in outcome.fitted.columns.ahead.channels].index(True)
-    return joint, float(shares[channel])
+    return joint, float(shares[_channel(outcome, world.model, world.model.joint(joint).id)])
+
+
+def _channel(outcome, model, joint):
+    """Index of the channel that a joint's first degree of freedom belongs to."""
+    channels = outcome.fitted.columns.ahead.channels
+    return [model.jnt_dofadr[joint] in dofs for dofs in channels].index(True)
 
 
 def missing_most(world, outcome):
-    """The joint whose missing force stands out most, or None where none does."""
-    found = _standing_out(world, outcome, range(world.model.njnt))
-    return found[0] if found and found[2] > BEYOND else None
+    """The joint whose missing force stands out most of those in which a perfect model would be
+    worth the price of a force without a name; None where there is none."""
+    model, room = world.model, outcome.fitted.evidence.room()
+    wide = room > PRICE * UNNAMED
+    joints = [j for j in range(model.njnt) if wide[_channel(outcome, model, j)]]
+    return _standing_out(world, outcome, joints)
 
 
 def unknown(joint, outcome):

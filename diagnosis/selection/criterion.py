@@ -201,6 +201,15 @@ class Evidence:
         groups = len(each) * (each / np.maximum(counting.sum(0), 1.0)).sum(1) / self.cells
         return Score(float(groups.mean()), groups, each.sum(1), amounts)
 
+    def room(self):
+        """Nats of the loss (channels,) that a prediction without errors but the noise would remove
+        from the reference."""
+        square = np.minimum(self.noise**2, self.reference)
+        log = 0.5 * np.log((self.reference + self.floor) / (square + self.floor))
+        counting = self._counting(self.reference)
+        each = counting * log / np.maximum(counting.sum(0), 1.0) / self.cells
+        return each.reshape(len(each), self.channels, -1).sum((0, 2))
+
     def plain(self, columns=(), amounts=np.zeros(0)):
         """Mean log RMS over all groups, counted alike, summed over channels, at amounts (p,) of
         columns (p,): what a fit lowers."""

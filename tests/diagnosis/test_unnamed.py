@@ -9,6 +9,7 @@ from arm import ARM, run
 
 from diagnosis import unnamed
 from diagnosis.recordings.recording import Recording
+from diagnosis.selection.criterion import PRICE
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.simulator import World
 
@@ -30,8 +31,9 @@ def smoothed(elbow, shoulder=0.0, scatter=0.1):
     return SimpleNamespace(force=force, force_sd=np.full((2, 2), scatter), free=free)
 
 
-def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1):
-    """errors: of the elbow, before and after, in ten noises; the shoulder errs by none."""
+def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)):
+    """errors: of the elbow, before and after, in ten noises; the shoulder errs by none. room: nats
+    that a perfect model would remove in the shoulder and in the elbow."""
     dependences = [SimpleNamespace(joint=j, variables=v) for j, v in depends]
     before, after = (np.array([[1.0, 1.0, 100 * e**2, 100 * e**2]]) for e in errors)
     evidence = SimpleNamespace(
@@ -40,6 +42,7 @@ def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1):
         channels=2,
         reference=before,
         squares=lambda columns, amounts: after,
+        room=lambda: np.array(room),
     )
     ahead = SimpleNamespace(channels=[np.array([0]), np.array([1])])
     setting = {FRICTION: (friction,), STIFFNESS: (0.1,), MASS: (0.3,)}
@@ -115,8 +118,17 @@ def test_where_nothing_has_a_name_the_joint_that_stands_out_is_told():
     assert (only["effect"], only["place"]["name"]) == ("unknown", "shoulder")
     assert only["depends_on"] == ["time"] and only["written_as"] == "none"
     assert unnamed.led(WORLD, both, [], False) == []
-    scatter = outcome(smoothed(0.12))  # 1.2 of its deviation
-    assert unnamed.led(WORLD, scatter, [], True) == []
+
+
+def test_a_force_without_a_name_is_told_only_where_a_perfect_model_is_worth_its_price():
+    price = PRICE * unnamed.UNNAMED
+    places = lambda room: [
+        f["place"]["name"]
+        for f in unnamed.led(WORLD, outcome(smoothed(0.3, shoulder=0.9), room=room), [], True)
+    ]
+    assert places((0.9 * price, 0.9 * price)) == []
+    assert places((1.1 * price, 1.1 * price)) == ["shoulder"]  # what stands out most
+    assert places((0.9 * price, 1.1 * price)) == ["elbow"]
 
 
 def test_what_lies_within_the_noise_says_nothing_against_a_name():

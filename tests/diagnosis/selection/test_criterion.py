@@ -250,3 +250,15 @@ def test_a_fit_is_the_best_of_several_minima():
     least = tried[np.argmin([np.log(square(x)).sum() for x in tried])]
     assert least == pytest.approx(1.0, abs=0.05)
     assert free(evidence, (0,)).amounts == pytest.approx([least], abs=0.01)
+
+
+def test_room_is_the_loss_that_a_perfect_model_removes():
+    """Of two channels, one with an error of ten noises and one within the noise."""
+    rng, ahead = np.random.default_rng(4), scene(channels=2, bands=2, noise=0.1)
+    noise = 0.1 * clustered(rng, ahead, share=0.0)
+    column = clustered(rng, ahead, share=0.0) * np.array([1.0, 0.0])
+    evidence = evidence_of(ahead, column + noise, column[..., None])
+    removed = -free(evidence, (0,)).loss
+    room = evidence.room()
+    assert removed == pytest.approx(room.sum(), rel=0.02) and room[0] > 2
+    assert abs(room[1]) < 1e-9
