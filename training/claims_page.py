@@ -131,8 +131,8 @@ def draw(experiments, path):
             [returns], seeds = data.paired(arm)
             mean = returns.mean(0)
             se = returns.std(0, ddof=min(1, len(seeds) - 1)) / np.sqrt(len(seeds))
-            color = COLORS.get(arm, f"C{k % 10}")
-            axes.plot(mean, color=color, marker="o", ms=3, label=f"{arm} ({len(seeds)})")
+            color, dash = COLORS.get(arm, f"C{k % 10}"), "-" if arm in COLORS else "--"
+            axes.plot(mean, color=color, ls=dash, marker="o", ms=3, label=f"{arm} ({len(seeds)})")
             axes.fill_between(range(len(mean)), mean - se, mean + se, color=color, alpha=0.2, lw=0)
         if len(data.line()):
             axes.axhline(np.mean(data.line()), color="#2e8b57", ls="--", lw=1)
