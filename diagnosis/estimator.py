@@ -61,8 +61,9 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         )
     search = Identification(world, train, say, log)
     found = search.run()
-    looks = [(found.fitted.setting, found.trajectory), ({}, found.first)]
-    looks = looks if found.fitted.setting else looks[1:]
+    looks = [({}, found.first)]
+    if found.fitted.setting:
+        looks.insert(0, (found.fitted.setting, found.trajectory))
     event = transients.happened(world, train, looks, found.smoother.position_noise)
     if event and not plausible(event.candidate, found.usual).inside(np.array(event.values)):
         event = None

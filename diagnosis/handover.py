@@ -92,7 +92,9 @@ class Check:
         as recorded moves a prediction by more than many an effect does, and so do those that
         another setting located."""
         near = self.path is not None
-        self.path = copy(self.smoother).locate(setting, self.path, passes=2 + (not near), near=near)
+        self.path = copy(self.smoother).locate(
+            setting, self.path, passes=2 if near else 3, near=near
+        )
         path, begun = self.path, {}
         for r in self.recordings:
             rows = path.rows(r)
@@ -126,7 +128,8 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
     have decided. refit(setting, out): what is left without one, fitted again; told: the Check of
     the errors that are told."""
     nominal = Files.of(world, {})
-    before, nothing = check.squares(nominal, {}) if setting else None, check.scattered()
+    before = check.squares(nominal, {}) if setting else None
+    nothing = check.scattered()
     while setting:
         files = Files.of(world, setting)
         after = check.squares(files, setting)

@@ -24,7 +24,7 @@ class Chain(Ahead):
 
     def start(self, trajectory, setting=None):
         super().start(trajectory, setting)
-        self.trajectory, self.setting, self.map = trajectory, setting, None
+        self.trajectory, self.map = trajectory, None
         last = np.array([w.last - w.first for w in self.windows])
         first = trajectory.begin(self.windows)
         ahead = np.arange(self.known.shape[1])
@@ -48,7 +48,7 @@ class Chain(Ahead):
         """A Chain of the first seconds of so many of the windows, evenly chosen."""
         chosen = [self.windows[i] for i in windowing.evenly(len(self.windows), number)]
         short = Chain(self.world, [windowing.beginning(w, seconds) for w in chosen], self.noise)
-        short.start(self.trajectory, self.setting)
+        short.start(self.trajectory, self.base)
         return short
 
     def _begun(self, windows):

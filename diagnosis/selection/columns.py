@@ -7,7 +7,7 @@ An option is a Start with its columns: one for each parameter where an effect ac
 one for a whole start of values where it does not (a dead zone, a delay of many rows).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -94,9 +94,8 @@ class Columns:
                 continue
             columns = tuple(range(len(self.parts), len(self.parts) + seen.sum()))
             self.parts += [c for c, yes in zip(own, seen) if yes]
-            given = {f.name: getattr(start, f.name) for f in fields(Start)}
-            given |= {f: given[f][seen] for f in ("directions", "low", "high")}
-            self.options.append(Option(**given, columns=columns))
+            shown = {f: getattr(start, f)[seen] for f in ("directions", "low", "high")}
+            self.options.append(Option(**vars(start) | shown, columns=columns))
             self.begun.append(start)
 
     def _remember(self, start, shows):

@@ -193,22 +193,25 @@ class Evidence:
         least = (BEYOND * self.noise) ** 2
         return np.where(self.count > 0, 1 - least / np.maximum(square, least + 1e-30), 0.0)
 
-    def _scored(self, square, amounts):
-        """The Score of mean squared errors (G, cells)."""
+    def _logs(self, square):
+        """(logs of mean squared errors (G, cells) over the reference's, as far as they count; their
+        shares of the loss)."""
         log = 0.5 * np.log((square + self.floor) / (self.reference + self.floor))
         counting = self._counting(np.maximum(square, self.reference))
         each = counting * log
-        groups = len(each) * (each / np.maximum(counting.sum(0), 1.0)).sum(1) / self.cells
+        return each, each / np.maximum(counting.sum(0), 1.0) / self.cells
+
+    def _scored(self, square, amounts):
+        """The Score of mean squared errors (G, cells)."""
+        each, shares = self._logs(square)
+        groups = len(each) * shares.sum(1)
         return Score(float(groups.mean()), groups, each.sum(1), amounts)
 
     def room(self):
         """Nats of the loss (channels,) that a prediction without errors but the noise would remove
         from the reference."""
-        square = np.minimum(self.noise**2, self.reference)
-        log = 0.5 * np.log((self.reference + self.floor) / (square + self.floor))
-        counting = self._counting(self.reference)
-        each = counting * log / np.maximum(counting.sum(0), 1.0) / self.cells
-        return each.reshape(len(each), self.channels, -1).sum((0, 2))
+        _, shares = self._logs(np.minimum(self.noise**2, self.reference))
+        return -shares.reshape(len(shares), self.channels, -1).sum((0, 2))
 
     def plain(self, columns=(), amounts=np.zeros(0)):
         """Mean log RMS over all groups, counted alike, summed over channels, at amounts (p,) of

@@ -31,15 +31,15 @@ def likely(chain, setting, starts):
     touches = 2 * len(free) < len(chain.begin)
     kept = [start for start in starts if start.candidate in setting]
     new = [start for start in starts if start.candidate not in setting]
-    long = [start for start in new if touches or chain.apart(start.candidate)]
-    short = [start for start in new if start not in long]
-    some = []
-    if short:
-        target, bases = _bases(chain, setting, short, free[windowing.evenly(len(free), ROWS)])
-        long += [start for start in short if start not in bases]
-        some = _ahead(target, bases)
-    if long:
-        some += _glanced(chain.beginnings(*GLANCES), setting, kept, long)
+    in_rows, in_windows, some = [], [], []
+    for start in new:
+        (in_windows if touches or chain.apart(start.candidate) else in_rows).append(start)
+    if in_rows:
+        target, bases = _bases(chain, setting, in_rows, free[windowing.evenly(len(free), ROWS)])
+        in_windows += [start for start in in_rows if start not in bases]
+        some = _by_rows(target, bases)
+    if in_windows:
+        some += _by_windows(chain.beginnings(*GLANCES), setting, kept, in_windows)
     return kept + some
 
 
@@ -52,7 +52,7 @@ def _best(gains):
     return [list(each.values()) for each in best.values()][:EACH]
 
 
-def _ahead(target, bases):
+def _by_rows(target, bases):
     """The Starts whose bases explain most of a target (n,)."""
     kept, beside = {}, np.zeros((len(target), 0))
     for _ in range(ROUNDS if bases else 0):
@@ -63,7 +63,7 @@ def _ahead(target, bases):
     return list(kept)
 
 
-def _glanced(short, setting, inside, starts):
+def _by_windows(short, setting, inside, starts):
     """The Starts that gain most in the windows of a short Chain, beside those inside a setting."""
     columns = Columns(short, setting, inside + starts)
     beam = Beam(columns, columns.evidence())

@@ -59,9 +59,11 @@ class Judge:
             evidence = columns.evidence(self.reference)
             index, low, high, precision, pull = problem(columns, range(len(columns.options)))
             score = evidence.score(index, low, high, precision, pull)
-            promised = evidence.plain() - evidence.plain(index, score.amounts)
-            worth = left and promised > DONE
-            better = self._lower(columns, evidence, score.amounts, setting) if worth else None
+            now = evidence.plain()
+            if not left or now - evidence.plain(index, score.amounts) <= DONE:
+                break
+            now += self._prior(setting, evidence)
+            better = self._lower(columns, evidence, score.amounts, now)
             if better is None:
                 break
             setting, residual = better
@@ -69,10 +71,11 @@ class Judge:
         self.reference = evidence.reference
         return Fitted(setting, score, columns, evidence)
 
-    def _lower(self, columns, evidence, amounts, setting):
-        """(setting, residual) after a step that lowers the loss by more than DONE, or None: of the
-        whole step and thirds of it, the first that is better than the next."""
-        least, best, share = self._whole(columns.residual, setting, evidence) - DONE, None, 1.0
+    def _lower(self, columns, evidence, amounts, now):
+        """(setting, residual) after a step that lowers the loss from what it is now by more than
+        DONE, or None: of the whole step and thirds of it, the first that is better than the
+        next."""
+        least, best, share = now - DONE, None, 1.0
         for _ in range(THIRDS):
             moved = moved_setting(columns, share * amounts)
             share /= 3
@@ -88,7 +91,11 @@ class Judge:
     def _whole(self, residual, setting, evidence):
         """Loss of a residual with nothing left out, priors included."""
         plain = Evidence(self.ahead, residual, np.zeros((*residual.shape, 0)))
-        return plain.plain() + self.cost(setting) / (evidence.cells * len(evidence.count))
+        return plain.plain() + self._prior(setting, evidence)
+
+    def _prior(self, setting, evidence):
+        """The cost of a setting's values, as a part of the loss."""
+        return self.cost(setting) / (evidence.cells * len(evidence.count))
 
     def cost(self, setting):
         """Minus the log prior density of a setting's values, nats; infinite where they are not

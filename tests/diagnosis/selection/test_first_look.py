@@ -83,9 +83,8 @@ def test_what_no_row_tells_is_asked_in_windows(scene, monkeypatch):
 def test_what_changes_nothing_in_the_rows_is_asked_in_windows(scene, monkeypatch):
     _, chain, _ = scene
     some = starts(scene, "coulomb_friction", "mass")
-    asked = []
     monkeypatch.setattr(chain, "missing", lambda setting, rows: np.ones((len(rows), 2)))
-    monkeypatch.setattr(first_look, "_glanced", lambda short, setting, kept, long: asked + long)
+    monkeypatch.setattr(first_look, "_by_windows", lambda short, setting, kept, asked: asked)
     assert likely(chain, {}, some) == some
 
 
@@ -95,7 +94,7 @@ def test_of_a_candidate_the_best_share_and_the_best_whole_value_are_kept(scene, 
     size = lambda x: replace(friction, directions=np.array([[x]]), low=np.array([0.3]))
     tried = [friction, replace(friction, directions=np.array([[-0.9]])), size(0.1), size(3.0)]
     target, bases = first_look._bases(scene[1], {}, tried, scene[1].begin[::20])
-    kept = first_look._ahead(target, bases)
+    kept = first_look._by_rows(target, bases)
     assert len(kept) == 2 and kept.count(tried[2]) == 1
     assert [start.whole for start in sorted(kept, key=lambda s: s.whole)] == [False, True]
 
