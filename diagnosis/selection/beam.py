@@ -5,13 +5,18 @@ start, nodes = Beam(columns, evidence).nodes()
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from diagnosis.effects.unmodelled import Unknown
-from diagnosis.selection.criterion import PRICE, Score, complexity
+from diagnosis.selection.criterion import PRICE, Score, complexity, paired
 from diagnosis.selection.judge import moved_setting, problem
+from diagnosis.selection.missing_force import Held
+from diagnosis.selection.plausibility import cost
 
 WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in each in full
 DEPTH = 4  # effects added in one round
 LEAST = 0.01  # loss that an effect must remove in the search
+CHANCE = 0.05  # that forces speak against an effect by accident
 
 
 @dataclass(frozen=True)
@@ -22,6 +27,7 @@ class Node:
     score: Score
     cost: float  # of its values
     price: float  # of its complexity
+    lacks: Score  # of the missing force
 
     @property
     def unpriced(self):
@@ -37,8 +43,10 @@ class Node:
 class Beam:
     """Looks for sets of options that lower the loss, with priors and the price of complexity."""
 
-    def __init__(self, columns, evidence):
+    def __init__(self, columns, evidence, missing=None):
+        """missing: a MissingForce, of which whatever joins a set has to hold something too."""
         self.columns, self.evidence = columns, evidence
+        self.held = Held(missing, columns.options) if missing and len(missing.rows) else None
         inside = columns.setting
         self.kept = tuple(k for k, o in enumerate(columns.options) if o.candidate in inside)
         self.free = [k for k, o in enumerate(columns.options) if o.candidate not in inside]
@@ -49,13 +57,19 @@ class Beam:
         score = self.evidence.score(*given)
         setting = moved_setting(self.columns, score.amounts, options)
         chosen = [self.columns.options[k] for k in options]
-        cost = sum(o.prior.cost(setting[o.candidate]) for o in chosen) / self.evidence.number
-        return Node(tuple(options), score, cost, PRICE * complexity(o.candidate for o in chosen))
+        nats = sum(cost(o.candidate, setting[o.candidate], o.prior) for o in chosen)
+        price = PRICE * complexity(o.candidate for o in chosen)
+        lacks = self.held and self.held.score(given[0], score.amounts)
+        return Node(tuple(options), score, nats / self.evidence.number, price, lacks)
+
+    def _against(self, node, new):
+        """Whether what joined a node explains the motion, but by forces that speak against it."""
+        return self.held and paired(new.lacks, node.lacks).p_value < CHANCE
 
     def nodes(self):
         """(node of the model as it is, all nodes met, best first)."""
         start = self.node(self.kept)
-        met, beam = {start.options: start}, [start]
+        met, beam, before = {start.options: start}, [start], np.inf
         for _ in range(DEPTH):
             grown = []
             for node in beam:
@@ -66,16 +80,21 @@ class Beam:
                     key = tuple(sorted(options))
                     if key in met:
                         continue
-                    met[key] = new = self.node(options)
+                    new = self.node(options)
+                    if self._against(node, new):
+                        continue
+                    met[key] = new
                     # of two that make up for each other neither is better alone
                     better = node is start or new.unpriced < node.unpriced - LEAST
                     if better and not self._unnamed(k):
                         grown.append(new)
-            if not grown:
-                break
             beam = self._different(grown)[:WIDTH]
             for node in beam:
-                self._reduced(node, met)
+                self._reduced(node, start, met)
+            best = min(node.loss for node in met.values())
+            if best >= before:
+                break
+            before = best
         return start, sorted(met.values(), key=lambda n: n.loss)
 
     def _unnamed(self, k):
@@ -91,32 +110,40 @@ class Beam:
             best.setdefault(candidates, node)
         return list(best.values())
 
-    def _reduced(self, node, met):
-        """Meet the sets that are left when effects go again, first the one that is missed least."""
+    def _reduced(self, node, start, met):
+        """Meet the sets that are left when effects go again, the one that is missed least first,
+        as long as that is better."""
         while len(node.options) > len(self.kept) + 1:
             fewer = []
             for out in node.options[len(self.kept) :]:
                 options = tuple(k for k in node.options if k != out)
                 key = tuple(sorted(options))
-                if key not in met:
-                    met[key] = self.node(options)
-                fewer.append(met[key])
-            node = min(fewer, key=lambda n: n.loss)
+                less = met.get(key) or self.node(options)
+                if not self._against(start, less):
+                    met[key] = less
+                    fewer.append(less)
+            less = min(fewer, key=lambda n: n.loss, default=node)
+            if less.loss >= node.loss:
+                break
+            node = less
 
     def gains(self, node):
-        """Nats that every option promises beside a node's, in a first look: a list."""
+        """{k: nats} that options of effects which a node does not hold promise, in a first look."""
         index, *_, precision, _ = problem(self.columns, node.options)
-        gain = self.evidence.looks(index, node.score.amounts, precision)
-        return [gain[list(o.columns)].sum() for o in self.columns.options]
+        gain, options = self.evidence.looks(index, node.score.amounts, precision), self.columns.options
+        held = {options[k].candidate for k in node.options}
+        return {
+            k: gain[list(o.columns)].sum()
+            for k, o in enumerate(options)
+            if o.candidate not in held
+        }
 
     def _looks(self, node):
         """Indices of the further options that promise most for their price in a first look."""
         gain, number = self.gains(node), self.evidence.number
-        taken = {self.columns.options[k].candidate for k in node.options}
         worth = lambda k: gain[k] / number - PRICE * complexity([self.columns.options[k].candidate])
-        free = [k for k in self.free if self.columns.options[k].candidate not in taken]
         best, seen = [], {}
-        for k in sorted(free, key=worth, reverse=True):
+        for k in sorted(gain, key=worth, reverse=True):
             candidate = self.columns.options[k].candidate
             seen[candidate] = seen.get(candidate, 0) + 1
             if seen[candidate] <= 2 and not self._unnamed(k):  # starts of one candidate

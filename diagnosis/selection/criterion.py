@@ -220,6 +220,10 @@ class Evidence:
         log = np.where(self.count > 0, 0.5 * np.log(square + self.floor), 0.0)
         return float(log.sum() / max((self.count > 0).sum(), 1) * self.channels)
 
+    def at(self, columns, amounts):
+        """Score of given amounts (p,) of columns (p,)."""
+        return self._scored(self.squares(columns, amounts), amounts)
+
     def score(self, columns, low, high, precision, pull):
         """Score of a hypothesis.
 

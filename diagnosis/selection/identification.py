@@ -14,9 +14,10 @@ from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import LEAST, Beam
 from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import Evidence, complexity, paired
+from diagnosis.selection.criterion import PRICE, Evidence, Score, complexity, paired
 from diagnosis.selection.first_look import likely
-from diagnosis.selection.judge import Fitted, Judge
+from diagnosis.selection.judge import Fitted, Judge, problem
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.starts import Starts
 from diagnosis.selection.unmodelled_force import dependences
@@ -25,6 +26,7 @@ ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
 CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
+TRIED = 2  # effects of a set that may be missed least, tried without
 
 
 @dataclass(frozen=True)
@@ -92,13 +94,14 @@ class Identification:
         others = [c for c in self.candidates if c not in setting]
         every, curves = [*setting, *others], self._curves(setting)
         starts = Starts(self.world, setting, self.usual, self.seen, self.trajectory)
-        some = likely(self.screen, setting, starts.of(every))
+        missing = MissingForce(self.screen, setting)
+        some = likely(missing, starts.of(every))
         some += [starts.curve(*curve) for curve in curves]
         columns = Columns(self.screen, setting, some, seen=self.seen)
         nominal = squares(self.screen, columns.residual if not setting else None)
         columns.secants(columns.evidence(nominal))
         evidence = columns.evidence(nominal)
-        beam = Beam(columns, evidence)
+        beam = Beam(columns, evidence, missing)
         start, nodes = beam.nodes()
         self.log(
             f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}"
@@ -112,6 +115,8 @@ class Identification:
             losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
             self.log(f"  {losses} {'' if fitted.settled else '(limit) '}{said(fitted.setting)}")
             judged.append(fitted)
+            if not fitted.settled:  # what has no value may hide others that have
+                judged.append(judge.fit(fitted.inside, steps=3))
         best = self._choose(judged, now, number)
         if best is not now:
             best = self.pruned(judge, judge.fit(best.setting))
@@ -165,19 +170,27 @@ class Identification:
         return after.loss < before.loss and no_chance(paired(before.score, after.score), number)
 
     def pruned(self, judge, fitted):
-        """Without the effects that do not earn their place beside the others."""
+        """Without the effects that do not earn their place beside the others. Those that small
+        changes show to do so are not tried without."""
         while len(fitted.setting) > 1:
             tries = [
                 judge.fit({c: v for c, v in fitted.setting.items() if c is not out}, steps=3)
-                for out in fitted.setting
+                for out in self._missed_least(fitted)
             ]
-            less = min(tries, key=lambda f: f.loss)
-            step = paired(less.score, fitted.score)
-            self.log(f"  without: {less.loss:.3f} {said(less.setting)}; p {step.p_value:.2g}")
-            if self.earned(less, fitted):
+            less = min(tries, key=lambda f: f.loss, default=None)
+            if less:
+                step = paired(less.score, fitted.score)
+                self.log(f"  without: {less.loss:.3f} {said(less.setting)}; p {step.p_value:.2g}")
+            if less is None or self.earned(less, fitted):
                 break
             fitted = less
         return fitted
+
+    def _missed_least(self, fitted):
+        """Up to TRIED effects of a set that may not earn their place."""
+        lone = [(without(fitted, c), c) for c in fitted.setting]
+        some = [(left.loss, k, c) for k, (left, c) in enumerate(lone) if not self.earned(left, fitted)]
+        return [c for *_, c in sorted(some)[:TRIED]]
 
     @staticmethod
     def _ranking(beam, start, nodes):
@@ -190,6 +203,31 @@ class Identification:
                     p = paired(start.score, node.score).p_value
                     best[candidate] = candidate, start.loss - node.loss, p
         return list(best.values())
+
+
+@dataclass(frozen=True)
+class Left:
+    """What is left of a Fitted set in a first look."""
+
+    score: Score
+    loss: float
+
+
+def without(fitted, candidate):
+    """Left when an effect of a Fitted set becomes nominal and the others move, as far as small
+    changes tell: nothing is lost by a limit that there was not."""
+    columns = fitted.columns
+    index, low, high, precision, pull = problem(columns, range(len(columns.options)))
+    for option in columns.options:
+        if option.candidate is candidate:
+            away = np.array(candidate.nominal) - fitted.setting[candidate]
+            gone = [away[row != 0][0] / row[row != 0][0] for row in option.directions]
+            low[list(option.columns)] = high[list(option.columns)] = gone
+    if not np.isfinite(low + high)[low == high].all():
+        return Left(fitted.score, -np.inf)
+    score = fitted.evidence.score(index, low, high, precision, pull)
+    rest = [c for c in fitted.setting if c is not candidate]
+    return Left(score, score.loss + PRICE * complexity(rest))
 
 
 def changing(judge, fitted):

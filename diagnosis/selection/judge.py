@@ -11,7 +11,7 @@ import numpy as np
 
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import PRICE, Evidence, Score, complexity
-from diagnosis.selection.plausibility import at_limit, plausible, possible
+from diagnosis.selection.plausibility import at_limit, cost, plausible
 from diagnosis.selection.starts import Starts
 
 STEPS = 6  # Gauss-Newton steps of a refit, at most
@@ -37,8 +37,14 @@ class Fitted:
     @property
     def settled(self):
         """Whether no value lies at a bound of what is plausible."""
-        options = self.columns.options
-        return not any(at_limit(o.candidate, self.setting[o.candidate], o.prior) for o in options)
+        return len(self.inside) == len(self.setting)
+
+    @property
+    def inside(self):
+        """The setting without the effects that have a value at a bound."""
+        prior = {o.candidate: o.prior for o in self.columns.options}
+        lies = lambda c, v: c in prior and at_limit(c, v, prior[c])
+        return {c: v for c, v in self.setting.items() if not lies(c, v)}
 
 
 class Judge:
@@ -100,11 +106,7 @@ class Judge:
     def cost(self, setting):
         """Minus the log prior density of a setting's values, nats; infinite where they are not
         possible."""
-        total = 0.0
-        for c, v in setting.items():
-            prior = plausible(c, self.usual)
-            total += prior.cost(v) if possible(c, v, prior) else np.inf
-        return total
+        return sum(cost(c, v, plausible(c, self.usual)) for c, v in setting.items())
 
     def _inside(self, candidate, values):
         prior = plausible(candidate, self.usual)

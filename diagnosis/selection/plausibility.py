@@ -45,9 +45,10 @@ TABLE = {
         ("plain", np.inf, -10, 10),
     ],
     "backlash": [("travel", 0.05, 0.0, 0.3)],
-    "gain": [("times", 0.25, 0.2, 5.0)],
+    "gain": [("times", 0.25, 0.4, 2.5)],
     "bias": [("strength", 0.3, -1.5, 1.5)],
-    "saturation": [("used", np.inf, 0.05, np.inf)],
+    "saturation": [("used", np.inf, 0.2, np.inf)],
+    "torque_speed": [("plain", np.inf, 0.0, np.inf), ("used", np.inf, 0.2, np.inf)],
     "delay": [("plain", 0.03, 0.0, 0.15)],
     "lag": [("plain", 0.03, 0.0, 0.3)],
     "dead_zone": [("used", 0.15, 0.0, 0.5)],
@@ -199,7 +200,7 @@ def at_limit(candidate, values, prior):
     At a bound of what is possible (no spring at all, a share of one) nothing lies beyond."""
     values = np.asarray(values, float)
     ends = np.array([(p.low, p.high) for p in candidate.parameters]).T
-    room = 1e-3 * np.minimum(abs(values) + prior.scale, 1e12)
+    room = 1e-3 * (abs(values) + np.where(np.isfinite(prior.scale), prior.scale, 0.0))
     low = (values <= prior.low + room) & (prior.low > ends[0])
     high = (values >= prior.high - room) & (prior.high < ends[1])
     return bool(((low | high) & (abs(values - prior.centre) > room)).any())
@@ -214,3 +215,8 @@ def possible(candidate, values, prior):
         ratio = np.linalg.norm(values) / np.linalg.norm(candidate.nominal)
         return abs(ratio - 1) <= STRENGTH
     return bool(candidate.effect.possible(values, candidate.nominal))
+
+
+def cost(candidate, values, prior):
+    """Minus the log prior density of values, nats; infinite where they are not possible."""
+    return prior.cost(values) if possible(candidate, values, prior) else np.inf

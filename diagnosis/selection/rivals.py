@@ -10,6 +10,7 @@ import numpy as np
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.first_look import likely
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.starts import Starts
 
 # cosine of two effects' columns beside the other findings', from which on one may stand for the
@@ -96,7 +97,7 @@ def _alike(judge, chain, fitted, candidate, pool):
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     near = _near(chain.world, candidate, pool) + list(rest)
     starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory).of(near)
-    columns = Columns(chain, rest, likely(chain, rest, starts))
+    columns = Columns(chain, rest, likely(MissingForce(chain, rest), starts))
     gone = columns.residual - chain.residual([fitted.setting])[0]
     evidence = Evidence(chain, gone, columns.array)
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]

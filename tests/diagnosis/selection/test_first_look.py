@@ -12,6 +12,7 @@ from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection import first_look
 from diagnosis.selection.first_look import likely
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.selection.starts import Start, Starts
 from diagnosis.simulation.simulator import World
@@ -44,12 +45,13 @@ def starts(scene, *names):
 
 
 def kept_of(scene, some, setting={}):
-    return {start.candidate.effect.name for start in likely(scene[1], setting, some)}
+    missing = MissingForce(scene[1], setting)
+    return {start.candidate.effect.name for start in likely(missing, some)}
 
 
 def test_what_is_missing_is_kept_first(scene, monkeypatch):
     monkeypatch.setattr(first_look, "EACH", 1)
-    monkeypatch.setattr(first_look, "ROUNDS", 1)
+    monkeypatch.setattr(first_look, "MORE", 0)
     some = starts(scene, "coulomb_friction", "armature", "mass")
     assert kept_of(scene, some) == {"coulomb_friction"}
     # what the model has already stays
@@ -68,7 +70,7 @@ def test_what_no_row_tells_is_asked_in_windows(scene, monkeypatch):
     """A sensor's scale, and everything where the motion mostly touches something."""
     world, chain, _ = scene
     monkeypatch.setattr(first_look, "EACH", 1)
-    monkeypatch.setattr(first_look, "ROUNDS", 1)
+    monkeypatch.setattr(first_look, "MORE", 0)
     each = starts(scene, "sensor_scale", "sensor_bias", "coulomb_friction", "mass", "armature")
     rows = {"coulomb_friction"}
     kept = kept_of(scene, each)
@@ -84,17 +86,16 @@ def test_what_changes_nothing_in_the_rows_is_asked_in_windows(scene, monkeypatch
     _, chain, _ = scene
     some = starts(scene, "coulomb_friction", "mass")
     monkeypatch.setattr(chain, "missing", lambda setting, rows: np.ones((len(rows), 2)))
-    monkeypatch.setattr(first_look, "_by_windows", lambda short, setting, kept, asked: asked)
-    assert likely(chain, {}, some) == some
+    monkeypatch.setattr(first_look, "_by_windows", lambda short, setting, kept, asked, rounds: asked)
+    assert likely(MissingForce(chain, {}), some) == some
 
 
-def test_of_a_candidate_the_best_share_and_the_best_whole_value_are_kept(scene, monkeypatch):
-    monkeypatch.setattr(first_look, "ROUNDS", 1)
+def test_of_a_candidate_the_best_share_and_the_best_whole_value_are_kept(scene):
     friction = starts(scene, "coulomb_friction")[0]
     size = lambda x: replace(friction, directions=np.array([[x]]), low=np.array([0.3]))
     tried = [friction, replace(friction, directions=np.array([[-0.9]])), size(0.1), size(3.0)]
-    target, bases = first_look._bases(scene[1], {}, tried, scene[1].begin[::20])
-    kept = first_look._by_rows(target, bases)
+    missing = MissingForce(scene[1], {})
+    kept = first_look._by_rows(missing.force, {s: missing.basis(s) for s in tried}, 1)
     assert len(kept) == 2 and kept.count(tried[2]) == 1
     assert [start.whole for start in sorted(kept, key=lambda s: s.whole)] == [False, True]
 
@@ -106,7 +107,7 @@ def test_a_look_at_all_starts_keeps_those_of_the_setting(scene, monkeypatch):
     friction = world.candidate("coulomb_friction", "pivot")
     setting = {armature: armature.nominal}
     every = Starts(world, setting, usual).of([armature, friction, world.candidate("mass", "arm")])
-    kept = {start.candidate for start in likely(chain, setting, every)}
+    kept = {start.candidate for start in likely(MissingForce(chain, setting), every)}
     assert {armature, friction} <= kept
 
 

@@ -1,0 +1,82 @@
+"""The force that is missing against the hidden one, and what speaks against a name that the motion
+speaks for."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from plants import DRIVEN_PENDULUM, NOISE, recorded
+from scipy.ndimage import gaussian_filter1d
+
+from diagnosis.estimation.ahead import GROUPS, cut_ahead
+from diagnosis.estimation.chain import Chain
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.selection.beam import Beam
+from diagnosis.selection.columns import Columns
+from diagnosis.selection.missing_force import MissingForce
+from diagnosis.selection.plausibility import Usual
+from diagnosis.selection.starts import Starts
+from diagnosis.simulation.simulator import World
+
+FRICTION = 0.1
+
+
+def located(torque_noise, rows=5.0):
+    """(World, Chain, Usual) of a pendulum with dry friction that its model lacks, whose
+    torque is measured with noise that lasts for some rows."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    rng, dry = np.random.default_rng(5), lambda t, q, v: -FRICTION * np.tanh(v / 0.01)
+    runs = [recorded(f"{k}.csv", k, push=dry, seconds=8.0) for k in (0, 1)]
+    for k, run in enumerate(runs):
+        noise = gaussian_filter1d(rng.normal(size=run.ctrl.shape), rows, axis=0)
+        runs[k] = replace(run, ctrl=run.ctrl + torque_noise * noise / noise.std())
+    smoother = Smoother(world, runs)
+    chain = Chain(world, cut_ahead(runs), np.array([NOISE]))
+    chain.start(smoother.locate({}))
+    return world, chain, Usual(world, runs, smoother.scale)
+
+
+def test_the_missing_force_is_the_hidden_one_and_what_the_right_name_holds():
+    world, chain, usual = located(0.0)
+    missing = MissingForce(chain, {})
+    hidden = -FRICTION * np.tanh(chain.trajectory.qvel[missing.rows, 0] / 0.01)
+    force = (missing.force / missing.weight)[:, 0]
+    assert np.median(abs(force - hidden)) < 0.1 * FRICTION
+    assert len(missing.rows) % GROUPS == 0 and missing.noise[0] < np.std(missing.force)
+    friction = world.candidate("coulomb_friction", "pivot")
+    start = Starts(world, {}, usual).of([friction])[0]
+    held = missing.basis(start)[..., 0] / start.directions[0, 0] * FRICTION
+    assert np.median(abs(missing.force - held)) < 0.1 * np.median(abs(missing.force))
+
+
+def test_a_mimic_of_noisy_torques_is_spoken_against_and_the_hidden_friction_is_not():
+    """A heavier joint obeys a noisy torque less: it predicts better, but lacks more force."""
+    world, chain, usual = located(0.3)
+    armature = world.candidate("armature", "pivot")
+    friction = world.candidate("coulomb_friction", "pivot")
+    columns = Columns(chain, {}, Starts(world, {}, usual).of([armature, friction]))
+    evidence = columns.evidence()
+    alone = {}
+    for missing in (None, MissingForce(chain, {})):
+        beam = Beam(columns, evidence, missing)
+        start, nodes = beam.nodes()
+        some = [node for node in nodes if len(node.options) == 1]
+        found = {columns.options[node.options[0]].candidate for node in some}
+        alone[missing is not None] = found
+    assert alone == {False: {armature, friction}, True: {friction}}
+    heavy = [k for k, o in enumerate(columns.options) if o.candidate is armature]
+    better = min(beam.node((k,)).unpriced for k in heavy)
+    assert better < start.unpriced - 0.05  # it does predict better
+
+
+@pytest.mark.parametrize("touching", [True, False])
+def test_without_rows_nothing_is_told(touching):
+    world, chain, usual = located(0.0)
+    free = np.ones(len(chain.trajectory.free), bool)
+    free[:3] = touching  # fewer rows than groups are none
+    chain.trajectory = replace(chain.trajectory, free=free)
+    missing = MissingForce(chain, {})
+    start = Starts(world, {}, usual).of([world.candidate("mass", "arm")])[0]
+    assert not len(missing.rows) and missing.basis(start) is None
+    assert Beam(Columns(chain, {}, [start]), Columns(chain, {}, [start]).evidence(), missing).nodes()
