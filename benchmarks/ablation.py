@@ -38,6 +38,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "what is within the noise counts": {"diagnosis.selection.criterion:BEYOND": 0.0},
     "a member of a class is no worse, even by chance": {"diagnosis.selection.rivals:CHANCE": 1.0},
     "differences must be alike": {"diagnosis.selection.criterion:INDEPENDENT": 0.0},
+    "forward alone": {"diagnosis.selection.beam:CHANCE": 0.0},
     "no first look": {"diagnosis.selection.first_look:EACH": 10**6},
     "no coarse steps": {"diagnosis.simulation.rows:COARSER": 1.0},
     "whole steps only": {"diagnosis.selection.judge:THIRDS": 1},

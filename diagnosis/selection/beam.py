@@ -130,7 +130,8 @@ class Beam:
     def gains(self, node):
         """{k: nats} that options of effects which a node does not hold promise, in a first look."""
         index, *_, precision, _ = problem(self.columns, node.options)
-        gain, options = self.evidence.looks(index, node.score.amounts, precision), self.columns.options
+        gain = self.evidence.looks(index, node.score.amounts, precision)
+        options = self.columns.options
         held = {options[k].candidate for k in node.options}
         return {
             k: gain[list(o.columns)].sum()

@@ -188,9 +188,9 @@ class Identification:
 
     def _missed_least(self, fitted):
         """Up to TRIED effects of a set that may not earn their place."""
-        lone = [(without(fitted, c), c) for c in fitted.setting]
-        some = [(left.loss, k, c) for k, (left, c) in enumerate(lone) if not self.earned(left, fitted)]
-        return [c for *_, c in sorted(some)[:TRIED]]
+        left = {c: without(fitted, c) for c in fitted.setting}
+        some = [c for c in left if not self.earned(left[c], fitted)]
+        return sorted(some, key=lambda c: left[c].loss)[:TRIED]
 
     @staticmethod
     def _ranking(beam, start, nodes):

@@ -41,7 +41,8 @@ def test_two_that_explain_all_are_met_beside_many_that_each_lower_squares_more()
     beam = Beam(SimpleNamespace(options=options, setting={}), evidence)
     start, nodes = beam.nodes()
     gains = beam.gains(start)
-    assert max(gains[0], gains[1]) < min(gains[k] for k in gains if k > 1)  # a look at squares leaves them out
+    # a look at squares leaves them out
+    assert max(gains[0], gains[1]) < min(gains[k] for k in gains if k > 1)
     met = [{options[k].candidate.name for k in node.options} for node in nodes]
     assert met[0] == {"strong", "weak"}
 

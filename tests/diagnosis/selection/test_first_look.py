@@ -86,7 +86,8 @@ def test_what_changes_nothing_in_the_rows_is_asked_in_windows(scene, monkeypatch
     _, chain, _ = scene
     some = starts(scene, "coulomb_friction", "mass")
     monkeypatch.setattr(chain, "missing", lambda setting, rows: np.ones((len(rows), 2)))
-    monkeypatch.setattr(first_look, "_by_windows", lambda short, setting, kept, asked, rounds: asked)
+    asked = lambda short, setting, kept, asked, rounds: asked
+    monkeypatch.setattr(first_look, "_by_windows", asked)
     assert likely(MissingForce(chain, {}), some) == some
 
 

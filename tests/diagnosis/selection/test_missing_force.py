@@ -79,4 +79,5 @@ def test_without_rows_nothing_is_told(touching):
     missing = MissingForce(chain, {})
     start = Starts(world, {}, usual).of([world.candidate("mass", "arm")])[0]
     assert not len(missing.rows) and missing.basis(start) is None
-    assert Beam(Columns(chain, {}, [start]), Columns(chain, {}, [start]).evidence(), missing).nodes()
+    columns = Columns(chain, {}, [start])
+    assert Beam(columns, columns.evidence(), missing).nodes()
