@@ -10,7 +10,6 @@ import numpy as np
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection.criterion import PRICE, Score, complexity, paired
 from diagnosis.selection.judge import moved_setting, problem
-from diagnosis.selection.missing_force import Held
 from diagnosis.selection.plausibility import cost
 
 WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in each in full
@@ -44,9 +43,10 @@ class Beam:
     """Looks for sets of options that lower the loss, with priors and the price of complexity."""
 
     def __init__(self, columns, evidence, missing=None):
-        """missing: a MissingForce, of which whatever joins a set has to hold something too."""
+        """missing: a MissingForce, which may not speak against whatever joins a set."""
         self.columns, self.evidence = columns, evidence
-        self.held = Held(missing, columns.options) if missing and len(missing.rows) else None
+        asked = missing and len(missing.rows)
+        self.missing = missing.evidence(columns.options) if asked else None
         inside = columns.setting
         self.kept = tuple(k for k, o in enumerate(columns.options) if o.candidate in inside)
         self.free = [k for k, o in enumerate(columns.options) if o.candidate not in inside]
@@ -59,12 +59,12 @@ class Beam:
         chosen = [self.columns.options[k] for k in options]
         nats = sum(cost(o.candidate, setting[o.candidate], o.prior) for o in chosen)
         price = PRICE * complexity(o.candidate for o in chosen)
-        lacks = self.held and self.held.score(given[0], score.amounts)
+        lacks = self.missing and self.missing.at(given[0], score.amounts)
         return Node(tuple(options), score, nats / self.evidence.number, price, lacks)
 
     def _against(self, node, new):
         """Whether what joined a node explains the motion, but by forces that speak against it."""
-        return self.held and paired(new.lacks, node.lacks).p_value < CHANCE
+        return self.missing and paired(new.lacks, node.lacks).p_value < CHANCE
 
     def nodes(self):
         """(node of the model as it is, all nodes met, best first)."""

@@ -233,7 +233,7 @@ class Evidence:
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
         amounts = np.zeros(len(columns))
         if not len(columns):
-            return self._scored(self.squares((), amounts), amounts)
+            return self.at((), amounts)
         prior = np.diag(precision), pull, low, high
         g, amounts = self._fitted(self._products(index), self.crossed[..., index], prior)
         each = np.einsum("gc,gcij->gij", self.weight(g, amounts), g)

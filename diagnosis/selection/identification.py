@@ -215,16 +215,16 @@ class Left:
 
 def without(fitted, candidate):
     """Left when an effect of a Fitted set becomes nominal and the others move, as far as small
-    changes tell: nothing is lost by a limit that there was not."""
+    changes tell. Of a limit that there was not they tell nothing, so it is as if none missed it."""
     columns = fitted.columns
     index, low, high, precision, pull = problem(columns, range(len(columns.options)))
+    away = np.array(candidate.nominal) - fitted.setting[candidate]
     for option in columns.options:
         if option.candidate is candidate:
-            away = np.array(candidate.nominal) - fitted.setting[candidate]
             gone = [away[row != 0][0] / row[row != 0][0] for row in option.directions]
+            if not np.isfinite(gone).all():
+                return Left(fitted.score, -np.inf)
             low[list(option.columns)] = high[list(option.columns)] = gone
-    if not np.isfinite(low + high)[low == high].all():
-        return Left(fitted.score, -np.inf)
     score = fitted.evidence.score(index, low, high, precision, pull)
     rest = [c for c in fitted.setting if c is not candidate]
     return Left(score, score.loss + PRICE * complexity(rest))

@@ -3,7 +3,7 @@ it effects hold.
 
 missing = MissingForce(chain, setting)
 missing.basis(start)                    # (rows, dofs, p): what a Start holds of it
-Held(missing, starts).score([0], [0.1]) # the criterion's, of what is lacking beside them
+missing.evidence(starts).at([0], [0.1]) # the criterion's Score of what is lacking beside them
 
 Predictions run from forces to motion, this from motion to forces. Where the forces that a model is
 given are measured, a joint that obeys them less is predicted better, and where a motion is noisy, a
@@ -25,20 +25,21 @@ LEAST = 0.05  # of its RMS, that its usual size is taken to be
 
 class MissingForce:
     """In rows of a Chain where nothing touches, under a setting. force (n, nv), in units of what is
-    usual in each dof; noise (nv,): how well that is known."""
+    usual in each dof; noise (nv,): how well that is known; free: all such rows, of which some are
+    looked at."""
 
     def __init__(self, chain, setting):
         self.chain, self.setting = chain, setting
         self.plain, nv = chain.plain(setting), chain.model.nv
         trajectory = chain.trajectory
-        free = chain.begin[~trajectory.free[chain.begin]]
-        self.rows = free[windowing.evenly(len(free), GROUPS * ROWS)]
+        self.free = chain.begin[~trajectory.free[chain.begin]]
+        self.rows = self.free[windowing.evenly(len(self.free), GROUPS * ROWS)]
         force = self._force(self.plain)
         usable = np.flatnonzero(np.isfinite(force).all(1))
         usable = usable[: len(usable) // GROUPS * GROUPS]
         self.rows, force = self.rows[usable], force[usable]
         self.seen = np.isfinite(chain.noise)
-        self.force, self.bases, self.noise = force, {}, np.full(nv, np.inf)
+        self.force, self.added, self.noise = force, {}, np.full(nv, np.inf)
         if len(usable):
             size = 1.4826 * np.median(abs(force), 0) + LEAST * rms(force) + 1e-12
             self.weight = np.where(self.seen, 1 / np.maximum(size, abs(force) / ODD), 0.0)
@@ -50,7 +51,7 @@ class MissingForce:
         """Generalized force (n, nv) that a plain setting lacks in the rows."""
         chain, nv = self.chain, self.chain.model.nv
         lacks = chain.missing(plain, self.rows)[:, nv:]
-        model = chain.map.model
+        model = chain.map.model  # of the setting just asked
         data, out = mujoco.MjData(model), np.empty_like(lacks)
         for row, qpos, gap in zip(out, chain.trajectory.qpos[self.rows], lacks):
             data.qpos[:] = qpos
@@ -60,38 +61,32 @@ class MissingForce:
 
     def basis(self, start):
         """(n, nv, p): what a Start holds of the force; None where no row tells."""
-        if start not in self.bases:
-            self.bases[start] = self._basis(start)
-        return self.bases[start]
-
-    def _basis(self, start):
         if self.chain.apart(start.candidate) or not len(self.rows):
             return None
-        added = [self.force - self._force(s) * self.weight for s in start.settings(self.plain)]
-        moved = [a for a in added if a.any()]
+        added = [self._added(s, start.candidate) for s in start.settings(self.plain)]
+        moved = any(a.any() for a in added)
         return np.stack(added, -1) if moved and np.isfinite(added).all() else None
+
+    def _added(self, plain, candidate):
+        """(n, nv): what a candidate of a plain setting holds, worked out once for its values."""
+        key = candidate, plain[candidate]
+        if key not in self.added:
+            self.added[key] = self.force - self._force(plain) * self.weight
+        return self.added[key]
+
+    def evidence(self, starts):
+        """The Evidence of the force and of what Starts hold of it, all their directions in turn."""
+        bases = [self.basis(start) for start in starts]
+        none = [np.zeros((*self.force.shape, len(start.directions))) for start in starts]
+        every = [zero if b is None else b for b, zero in zip(bases, none)]
+        every = np.concatenate([self.force[..., None], *every], -1)
+        every = every.reshape(GROUPS, len(every) // GROUPS, *every.shape[1:])
+        return Evidence(Rows(every, self), every[..., 0], every[..., 1:])
 
 
 def rms(x):
     """Of each column."""
     return np.sqrt(np.mean(x**2, 0))
-
-
-class Held:
-    """How much of a MissingForce sets of some Starts hold."""
-
-    def __init__(self, missing, starts):
-        bases = [missing.basis(start) for start in starts]
-        none = [np.zeros((*missing.force.shape, len(start.directions))) for start in starts]
-        every = [b if b is not None else zero for b, zero in zip(bases, none)]
-        every = np.concatenate([missing.force[..., None], *every], -1)
-        every = every.reshape(GROUPS, len(every) // GROUPS, *every.shape[1:])
-        self.evidence = Evidence(Rows(every, missing), every[..., 0], every[..., 1:])
-
-    def score(self, columns, amounts):
-        """The Score of what is lacking beside some columns, counted through all starts, at
-        amounts."""
-        return self.evidence.at(columns, amounts)
 
 
 class Rows:
