@@ -134,9 +134,7 @@ class Beam:
         options = self.columns.options
         held = {options[k].candidate for k in node.options}
         return {
-            k: gain[list(o.columns)].sum()
-            for k, o in enumerate(options)
-            if o.candidate not in held
+            k: gain[list(o.columns)].sum() for k, o in enumerate(options) if o.candidate not in held
         }
 
     def _looks(self, node):
