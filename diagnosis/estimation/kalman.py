@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
-
 
 @dataclass(frozen=True)
 class Smoothed:
@@ -53,7 +51,7 @@ def smooth(A, c, Q, y, R, start, spread):
         K, Finv, k = gain[t], inverse[t], known[t]
         Kt = K.transpose(0, 2, 1)
         u = ((Finv @ error[t][..., None]) - Kt @ r[..., None])[..., 0]
-        D = np.einsum("bii->bi", Finv) + np.einsum("bij,bjk,bki->bi", Kt, N, K, optimize=PAIRS)
+        D = np.einsum("bii->bi", Finv) + (Kt @ N * Kt).sum(-1)
         measurement[0] += (u**2 * k).sum(0)
         measurement[1] += (D * k).sum(0)
         # r before the measurement: H' F^-1 v + (I - K H)' r
@@ -65,9 +63,7 @@ def smooth(A, c, Q, y, R, start, spread):
         N[:, :m, :m] += Finv
         P = covariance[t]
         state[t] = predicted[t] + (P @ r[..., None])[..., 0]
-        variance[t] = np.einsum("bii->bi", P) - np.einsum(
-            "bij,bjk,bki->bi", P, N, P, optimize=PAIRS
-        )
+        variance[t] = np.einsum("bii->bi", P) - (P @ N * P).sum(-1)
     return Smoothed(
         state, np.maximum(variance, 0.0), tuple(process), tuple(measurement), float(likelihood)
     )
@@ -88,10 +84,8 @@ def _forward(A, c, Q, y, known, R, start, spread):
         F = np.where(pair, P[:, :m, :m] + R * eye, eye)
         inverse = np.linalg.inv(F)
         error = np.where(k, y[t] - x[:, :m], 0.0)
-        likelihood -= 0.5 * (
-            np.linalg.slogdet(F)[1].sum()
-            + np.einsum("bi,bij,bj->", error, inverse, error, optimize=PAIRS)
-        )
+        squares = error * (inverse @ error[..., None])[..., 0]
+        likelihood -= 0.5 * (np.linalg.slogdet(F)[1].sum() + squares.sum())
         inverse = inverse * pair
         K = P[:, :, :m] @ inverse
         gains[t], inverses[t], errors[t] = K, inverse, error

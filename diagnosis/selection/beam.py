@@ -14,8 +14,8 @@ from diagnosis.selection.plausibility import cost
 
 WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in each in full
 DEPTH = 4  # effects added in one round
-LEAST = 0.01  # loss that an effect must remove in the search
 CHANCE = 0.05  # that forces speak against an effect by accident
+LEAST = 0.01  # loss that an effect must remove in the search
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Node:
     score: Score
     cost: float  # of its values
     price: float  # of its complexity
-    lacks: Score  # of the missing force
+    lacks: Score  # of the missing force, if that is asked
 
     @property
     def unpriced(self):
@@ -44,23 +44,31 @@ class Beam:
 
     def __init__(self, columns, evidence, missing=None):
         """missing: a MissingForce, which may not speak against whatever joins a set."""
-        self.columns, self.evidence = columns, evidence
+        self.columns, self.evidence, self.known = columns, evidence, {}
         asked = missing and len(missing.rows)
         self.missing = missing.evidence(columns.options) if asked else None
         inside = columns.setting
         self.kept = tuple(k for k, o in enumerate(columns.options) if o.candidate in inside)
         self.free = [k for k, o in enumerate(columns.options) if o.candidate not in inside]
 
-    def node(self, options):
-        """The Node of some options (those kept included)."""
+    def node(self, options, by=None):
+        """The Node of some options (those kept included); by: the Evidence that they are fitted to,
+        if not that of the motion."""
+        key = by is None, tuple(sorted(options))
+        if key not in self.known:
+            self.known[key] = self._worked_out(tuple(options), by or self.evidence)
+        return self.known[key]
+
+    def _worked_out(self, options, evidence):
         given = problem(self.columns, options)
-        score = self.evidence.score(*given)
+        score = evidence.score(*given)
         setting = moved_setting(self.columns, score.amounts, options)
         chosen = [self.columns.options[k] for k in options]
         nats = sum(cost(o.candidate, setting[o.candidate], o.prior) for o in chosen)
         price = PRICE * complexity(o.candidate for o in chosen)
-        lacks = self.missing and self.missing.at(given[0], score.amounts)
-        return Node(tuple(options), score, nats / self.evidence.number, price, lacks)
+        asked = self.missing and evidence is self.evidence
+        lacks = self.missing.at(given[0], score.amounts) if asked else None
+        return Node(options, score, nats / evidence.number, price, lacks)
 
     def _against(self, node, new):
         """Whether what joined a node explains the motion, but by forces that speak against it."""
@@ -69,25 +77,14 @@ class Beam:
     def nodes(self):
         """(node of the model as it is, all nodes met, best first)."""
         start = self.node(self.kept)
-        met, beam, before = {start.options: start}, [start], np.inf
+        met, beam, before = {self._key(start): start}, [start], np.inf
+        proposed = self._proposed(start)
+        if proposed is not start and not self._against(start, proposed):
+            met[self._key(proposed)] = proposed
+            beam.append(proposed)
+            self._reduced(proposed, start, met)
         for _ in range(DEPTH):
-            grown = []
-            for node in beam:
-                # first every option in full: what lowers squares most is not what lowers their
-                # logarithm most, and what comes first decides what is tried beside it
-                for k in self.free if node is start else self._looks(node):
-                    options = (*node.options, k)
-                    key = tuple(sorted(options))
-                    if key in met:
-                        continue
-                    new = self.node(options)
-                    if self._against(node, new):
-                        continue
-                    met[key] = new
-                    # of two that make up for each other neither is better alone
-                    better = node is start or new.unpriced < node.unpriced - LEAST
-                    if better and not self._unnamed(k):
-                        grown.append(new)
+            grown = [new for node in beam for new in self._joined(node, met)]
             beam = self._different(grown)[:WIDTH]
             for node in beam:
                 self._reduced(node, start, met)
@@ -96,6 +93,43 @@ class Beam:
                 break
             before = best
         return start, sorted(met.values(), key=lambda n: n.loss)
+
+    @staticmethod
+    def _key(node):
+        return tuple(sorted(node.options))
+
+    def _joined(self, node, met):
+        """[Node] of sets with one effect more than a node that are better; those that the missing
+        force does not speak against are met."""
+        # first every option in full: what lowers squares most is not what lowers their logarithm
+        # most, and what comes first decides what is tried beside it
+        first = node.options == self.kept
+        grown = []
+        for k in self.free if first else self._looks(node):
+            new = self.node((*node.options, k))
+            if self._against(node, new):
+                continue
+            met[self._key(new)] = new
+            # of two that make up for each other neither is better alone
+            better = first or new.unpriced < node.unpriced - LEAST
+            if better and not self._unnamed(k):
+                grown.append(new)
+        return grown
+
+    def _proposed(self, start):
+        """The Node of what the missing force alone would choose, one effect after the other: where
+        many joints lack something, that is more than what a few steps along the motion add."""
+        if not self.missing:
+            return start
+        best, grown = None, [self.node(start.options, self.missing)]
+        while grown and (best is None or grown[0].loss < best.loss - LEAST):
+            best, options = grown[0], self.columns.options
+            held = {options[k].candidate for k in best.options}
+            others = [k for k in self.free if options[k].candidate not in held]
+            others = [k for k in others if not self._unnamed(k)]
+            grown = [self.node((*best.options, k), self.missing) for k in others]
+            grown.sort(key=lambda n: n.loss)
+        return self.node(best.options)
 
     def _unnamed(self, k):
         """Whether an option is a curve: it leaves so little that what stands beside it would fill
@@ -116,11 +150,9 @@ class Beam:
         while len(node.options) > len(self.kept) + 1:
             fewer = []
             for out in node.options[len(self.kept) :]:
-                options = tuple(k for k in node.options if k != out)
-                key = tuple(sorted(options))
-                less = met.get(key) or self.node(options)
+                less = self.node(tuple(k for k in node.options if k != out))
                 if not self._against(start, less):
-                    met[key] = less
+                    met[self._key(less)] = less
                     fewer.append(less)
             less = min(fewer, key=lambda n: n.loss, default=node)
             if less.loss >= node.loss:

@@ -7,7 +7,8 @@ An option is a Start with its columns: one for each parameter where an effect ac
 one for a whole start of values where it does not (a dead zone, a delay of many rows).
 """
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +35,12 @@ class Option(Start):
         else:
             values = self.base + np.asarray(amounts) @ self.directions
         return tuple(np.clip(values, self.prior.low, self.prior.high))
+
+    def about(self, values):
+        """The same with other values (k,) for its base, as if its columns were the same there."""
+        moved = np.linalg.lstsq(self.directions.T, np.asarray(values) - self.base, rcond=None)[0]
+        low, high = self.low - moved, self.high - moved
+        return replace(self, base=np.asarray(values, float), low=low, high=high)
 
     def quadratic(self):
         """(precision, pull) (p,) of the prior about the base, for the criterion."""
@@ -64,6 +71,13 @@ class Columns:
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts, self.begun = [], []  # the Start of every option
         self._simulate(starts)
+
+    def about(self, setting, residual):
+        """These Columns about other values of the setting's effects, whose residual is known."""
+        other = copy(self)
+        other.setting, other.residual = setting, residual
+        other.options = [option.about(setting[option.candidate]) for option in self.options]
+        return other
 
     def evidence(self, reference=None):
         """The Evidence of the residual and all columns."""

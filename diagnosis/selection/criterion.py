@@ -24,7 +24,6 @@ BEYOND = 1.5  # of the noise, from which on an error counts
 ITERATIONS = 4  # of reweighted least squares
 INDEPENDENT = 2.0  # errors as which the rows of a cell count, where a few groups or windows decide
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
-PAIRS = ["einsum_path", (0, 1), (0, 1)]  # order of a product of three, worked out once
 
 
 @dataclass(frozen=True)
@@ -184,8 +183,8 @@ class Evidence:
     def _square(self, g, amounts):
         """Mean squared error (G, cells) of amounts (p,) or (G, p), from products g."""
         z = np.concatenate([np.ones((*amounts.shape[:-1], 1)), -amounts], -1)
-        z = np.broadcast_to(z, (len(g), z.shape[-1]))
-        square = np.einsum("gi,gcij,gj->gc", z, g, z, optimize=PAIRS)
+        z = np.atleast_2d(z)[:, None, :, None]
+        square = (np.swapaxes(z, 2, 3) @ (g @ z))[..., 0, 0]
         return np.maximum(square, 0.0) / np.maximum(self.count, 1)
 
     def _counting(self, square):
@@ -301,39 +300,34 @@ class Evidence:
         return np.where(seen, score**2 / np.where(seen, curve, 1.0) / 2, 0.0)
 
 
-def each_bounded(matrices, vectors, low, high):
-    """bounded() of matrices (G, p, p) and vectors (G, p): those that meet no bound all at once."""
-    scale = np.sqrt(np.maximum(np.einsum("gii->gi", matrices), 1e-300))
-    even = matrices / (scale[:, :, None] * scale[:, None]) + 1e-9 * np.eye(len(low))
-    start = np.clip(np.zeros(len(low)), low, high)
-    free = np.linalg.solve(even, (vectors / scale)[..., None])[..., 0] / scale
-    out = start + (free - start)
-    for g in np.flatnonzero(~((free >= low) & (free <= high)).all(1)):
-        out[g] = bounded(matrices[g], vectors[g], low, high)
-    return out
-
-
 def bounded(matrix, vector, low, high):
-    """The minimum of x' matrix x / 2 - vector x between bounds, by an active set of those met."""
-    p, fixed = len(vector), np.zeros(len(vector), bool)
-    x = np.clip(np.zeros(p), low, high)
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    even = matrix / np.outer(scale, scale) + 1e-9 * np.eye(p)
-    for _ in range(4 * p + 1):
-        free = np.flatnonzero(~fixed)
-        if len(free):
-            push = vector[free] / scale[free] - even[np.ix_(free, fixed)] @ (x * scale)[fixed]
-            step = np.linalg.solve(even[np.ix_(free, free)], push) / scale[free] - x[free]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                room = np.where(step > 0, high[free] - x[free], low[free] - x[free]) / step
-            share = np.min(np.where(step == 0, 1.0, room), initial=1.0)
-            x[free] = np.clip(x[free] + share * step, low[free], high[free])
-            if share < 1:
-                fixed[free[room <= share]] = True
-                continue
-        slope = matrix @ x - vector
-        inward = np.where(x - low < high - x, -slope, slope) / scale * (fixed & (low < high))
-        if not fixed.any() or inward.max() <= 1e-9 * abs(vector / scale).max(initial=0.0):
+    """The minimum of x' matrix x / 2 - vector x between bounds (p,)."""
+    return each_bounded(matrix[None], vector[None], low, high)[0]
+
+
+def each_bounded(matrices, vectors, low, high):
+    """bounded() of matrices (G, p, p) and vectors (G, p) at once, by active sets of the bounds that
+    are met."""
+    scale = np.sqrt(np.maximum(np.einsum("gii->gi", matrices), 1e-300))
+    eye, goal, (low, high) = np.eye(len(low)), vectors / scale, (low * scale, high * scale)
+    even = matrices / (scale[:, :, None] * scale[:, None]) + 1e-9 * eye
+    x, fixed = np.clip(np.zeros_like(goal), low, high), np.zeros(goal.shape, bool)
+    for _ in range(4 * len(eye) + 1):
+        free = ~fixed
+        inside = np.where(free[:, :, None] & free[:, None], even, eye)
+        push = np.where(free, goal - (even @ (x * fixed)[..., None])[..., 0], x)
+        step = np.linalg.solve(inside, push[..., None])[..., 0] - x
+        room = np.where(step > 0, high, low) - x
+        room = np.divide(room, step, out=np.full_like(x, np.inf), where=step != 0)
+        share = np.minimum(room.min(1, initial=np.inf), 1.0)[:, None]
+        x = np.clip(x + share * step, low, high)
+        met = free & (share < 1) & (room <= share)
+        # where nothing is met, the bound that holds back most is left
+        slope = (even @ x[..., None])[..., 0] - goal
+        inward = np.where(x - low < high - x, -slope, slope) * (fixed & (low < high) & (share == 1))
+        most = inward.max(1, initial=0.0, keepdims=True)
+        left = (inward == most) & (most > 1e-9 * abs(goal).max(1, initial=0.0, keepdims=True))
+        fixed = (fixed | met) & ~left
+        if not (met | left).any():
             break
-        fixed[np.argmax(inward)] = False
-    return x
+    return x / scale

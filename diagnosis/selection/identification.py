@@ -119,7 +119,7 @@ class Identification:
                 judged.append(judge.fit(fitted.inside, steps=3))
         best = self._choose(judged, now, number)
         if best is not now:
-            best = self.pruned(judge, judge.fit(best.setting))
+            best = self.pruned(judge, self.further(judge, best))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         better = best.setting.keys() != setting.keys()
         return best, better, [] if setting else self._ranking(beam, start, nodes)
@@ -164,6 +164,13 @@ class Identification:
         good = [f for f in judged if f is not now and self.earned(now, f, number)]
         good = [f for f in good if f is best or not self.earned(f, best)]
         return min(good, key=lambda f: (complexity(f.setting), f.loss))
+
+    @staticmethod
+    def further(judge, fitted):
+        """Fitted with more steps, if that predicts better what is left out too: what they lower is
+        the error of what they are fitted to."""
+        more = judge.fit(fitted.setting)
+        return more if more.settled and more.loss < fitted.loss else fitted
 
     def earned(self, before, after, number=1):
         """Whether a set is worth its complexity, and better by no chance among those looked at."""

@@ -57,25 +57,43 @@ class Judge:
         self.seen = {} if seen is None else seen
 
     def fit(self, setting, steps=STEPS):
-        """The Fitted values of a set of effects, begun at the values given."""
-        setting, residual = {c: self._inside(c, v) for c, v in setting.items()}, None
-        for left in range(steps, -1, -1):
-            starts = Starts(self.ahead.world, setting, self.usual, self.seen).of(setting)
-            columns = Columns(self.ahead, setting, starts, residual, self.seen)
-            evidence = columns.evidence(self.reference)
-            index, low, high, precision, pull = problem(columns, range(len(columns.options)))
-            score = evidence.score(index, low, high, precision, pull)
-            now = evidence.plain()
-            if not left or now - evidence.plain(index, score.amounts) <= DONE:
+        """The Fitted values of a set of effects, begun at the values given.
+
+        Columns are carried along from step to step, and simulated again where they lower the loss
+        no more and at the end: of a set of many effects they are most of the time.
+        """
+        columns, carried = self._columns({c: self._inside(c, v) for c, v in setting.items()}), False
+        while steps:
+            better = self._better(columns)
+            if better:
+                columns, carried, steps = columns.about(*better), True, steps - 1
+            elif carried:
+                columns, carried = self._columns(columns.setting, columns.residual), False
+            else:
                 break
-            now += self._prior(setting, evidence)
-            better = self._lower(columns, evidence, score.amounts, now)
-            if better is None:
-                break
-            setting, residual = better
-        score = score.plus(self.cost(setting), evidence.number)
+        if carried:
+            columns = self._columns(columns.setting, columns.residual)
+        evidence = columns.evidence(self.reference)
         self.reference = evidence.reference
-        return Fitted(setting, score, columns, evidence)
+        score = evidence.score(*problem(columns, range(len(columns.options))))
+        score = score.plus(self.cost(columns.setting), evidence.number)
+        return Fitted(columns.setting, score, columns, evidence)
+
+    def _columns(self, setting, residual=None):
+        """Those of a setting's effects, about it."""
+        starts = Starts(self.ahead.world, setting, self.usual, self.seen).of(setting)
+        return Columns(self.ahead, setting, starts, residual, self.seen)
+
+    def _better(self, columns):
+        """(setting, residual) after a step from a setting that its Columns lower the loss with, or
+        None."""
+        evidence = columns.evidence(self.reference)
+        index, *rest = problem(columns, range(len(columns.options)))
+        amounts, now = evidence.score(index, *rest).amounts, evidence.plain()
+        if now - evidence.plain(index, amounts) <= DONE:
+            return None
+        now += self._prior(columns.setting, evidence)
+        return self._lower(columns, evidence, amounts, now)
 
     def _lower(self, columns, evidence, amounts, now):
         """(setting, residual) after a step that lowers the loss from what it is now by more than

@@ -4,6 +4,7 @@ it effects hold.
 missing = MissingForce(chain, setting)
 missing.basis(start)                    # (rows, dofs, p): what a Start holds of it
 missing.evidence(starts).at([0], [0.1]) # the criterion's Score of what is lacking beside them
+missing.scores({}, {friction: (0.1,)}) # the Scores of what settings lack
 
 Predictions run from forces to motion, this from motion to forces. Where the forces that a model is
 given are measured, a joint that obeys them less is predicted better, and where a motion is noisy, a
@@ -79,9 +80,21 @@ class MissingForce:
         bases = [self.basis(start) for start in starts]
         none = [np.zeros((*self.force.shape, len(start.directions))) for start in starts]
         every = [zero if b is None else b for b, zero in zip(bases, none)]
-        every = np.concatenate([self.force[..., None], *every], -1)
+        return self._evidence(np.concatenate([self.force[..., None], *every], -1))
+
+    def _evidence(self, every):
+        """Of the force and what is held of it (n, nv, 1 + p)."""
         every = every.reshape(GROUPS, len(every) // GROUPS, *every.shape[1:])
         return Evidence(Rows(every, self), every[..., 0], every[..., 1:])
+
+    def scores(self, *settings):
+        """[Score] of the force that settings lack, or None where no row tells."""
+        if not len(self.rows):
+            return None
+        plain = [self.chain.plain(setting) for setting in settings]
+        held = [self.force - self._force(p) * self.weight for p in plain]
+        evidence = self._evidence(np.stack([self.force, *held], -1))
+        return [evidence.at([k], np.ones(1)) for k in range(len(held))]
 
 
 def rms(x):

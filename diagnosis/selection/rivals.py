@@ -38,7 +38,7 @@ def classes(candidates, judge, chain, fitted, log=lambda what: None):
         if own is not candidate:
             log(f"  better in its class: {candidate} -> {own}")
             swapped = True
-        tied = [(f, o) for f, o in members if _tied(f, fitted)]
+        tied = [(f, o) for f, o in members if _tied(f.score, fitted.score)]
         others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
         told = {o for o, _ in others[own]}
         pool = [c for c in candidates if c not in told and c not in fitted.setting]
@@ -49,14 +49,16 @@ def classes(candidates, judge, chain, fitted, log=lambda what: None):
 
 def _members(candidates, judge, chain, fitted, candidate):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
-    their price, best first."""
+    their price, best first, and against which the missing force does not speak."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting and c.effect.name != "time_step"]
-    near = _alike(judge, chain, fitted, candidate, pool)
-    out = []
+    missing, out = MissingForce(chain, rest), []
+    near = _alike(judge, missing, fitted, candidate, pool)
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
-        if tried.settled and (_tied(tried, fitted) or tried.loss < fitted.loss):
+        good = tried.settled and (_tied(tried.score, fitted.score) or tried.loss < fitted.loss)
+        lacks = good and missing.scores(tried.setting, fitted.setting)
+        if good and (lacks is None or _tied(*lacks)):
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
@@ -76,28 +78,28 @@ def _late(pool, judge, chain, fitted, candidate):
     out = []
     for other in near:
         tried = judge.fit({**rest, other: fitted.setting[candidate]})
-        if tried.settled and _tied(tried, fitted):
+        if tried.settled and _tied(tried.score, fitted.score):
             out.append((other, tried.setting[other]))
     return out
 
 
 def _tied(tried, fitted):
-    """Whether a set predicts as well as another one, or worse by no more than chance."""
-    worse = paired(tried.score, fitted.score)
+    """Whether a Score is as good as another one, or worse by no more than chance."""
+    worse = paired(tried, fitted)
     return worse.gain < TIED or worse.p_value > CHANCE
 
 
-def _alike(judge, chain, fitted, candidate, pool):
+def _alike(judge, missing, fitted, candidate, pool):
     """[(other, values)] with columns like the candidate's force beside the other findings', most
     alike first.
 
     Asked at the model without the finding, for what is gone there is what the others have to
     explain.
     """
-    rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
+    chain, rest = missing.chain, missing.setting
     near = _near(chain.world, candidate, pool) + list(rest)
     starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory).of(near)
-    columns = Columns(chain, rest, likely(MissingForce(chain, rest), starts))
+    columns = Columns(chain, rest, likely(missing, starts))
     gone = columns.residual - chain.residual([fitted.setting])[0]
     evidence = Evidence(chain, gone, columns.array)
     kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]

@@ -104,3 +104,21 @@ def test_of_options_that_promise_the_same_the_simplest_is_tried_first(monkeypatc
     beam, names = made(named, first + 0.5 * second, ahead, prices=(0, 2, 1))
     node = beam.node((0,))
     assert [beam.columns.options[k].candidate.name for k in beam._looks(node)] == ["near"]
+
+
+def test_what_many_joints_lack_is_met_at_once_where_the_missing_force_shows_it(monkeypatch):
+    monkeypatch.setattr(beam_module, "DEPTH", 1)
+    rng, ahead = np.random.default_rng(4), scene(channels=6)
+    every = clustered(rng, ahead, share=0.0)
+    named = {f"joint {k}": every * (np.arange(6) == k) for k in range(6)}
+    named["mimic"] = clustered(rng, ahead, share=0.0)
+    residual = every + 0.1 * clustered(rng, ahead, share=0.0)
+    alone, _ = made(named, residual, ahead)
+    assert max(len(node.options) for node in alone.nodes()[1]) == 1
+    force = SimpleNamespace(rows=[0], evidence=lambda options: alone.evidence)
+    beam = Beam(alone.columns, alone.evidence, force)
+    assert set(beam.nodes()[1][0].options) == set(range(6))
+    # but the motion judges it: what that does not need goes again
+    motion, names = made(named, named["joint 0"] + 0.001 * residual, ahead)
+    best = Beam(motion.columns, motion.evidence, force).nodes()[1][0]
+    assert names(best) == {"joint 0"}

@@ -67,6 +67,18 @@ def test_a_set_is_chosen_for_its_worth(search):
     assert search._choose([now, little], now, 10) is now  # not worth its price
 
 
+@pytest.mark.parametrize(
+    "loss, settled, kept", [(-1.1, True, True), (-0.4, True, False), (-1.1, False, False)]
+)
+def test_a_refit_with_more_steps_has_to_predict_better_what_is_left_out(
+    search, loss, settled, kept
+):
+    first = fitted(search, ["coulomb_friction"], -1.0)
+    more = fitted(search, ["coulomb_friction"], loss, settled)
+    judge = SimpleNamespace(fit=lambda setting: more)
+    assert search.further(judge, first) is (more if kept else first)
+
+
 def node(losses, price, *names):
     """A Node of a beam with these losses of groups; names: indices of its options."""
     groups = np.array(losses, float)

@@ -46,6 +46,8 @@ def test_the_missing_force_is_the_hidden_one_and_what_the_right_name_holds():
     assert len(missing.rows) % GROUPS == 0 and missing.noise[0] < np.std(missing.force)
     friction = world.candidate("coulomb_friction", "pivot")
     start = Starts(world, {}, usual).of([friction])[0]
+    without, right, wrong = missing.scores({}, {friction: (FRICTION,)}, {friction: (3 * FRICTION,)})
+    assert right.loss < without.loss - 1 < wrong.loss
     held = missing.basis(start)[..., 0] / start.directions[0, 0] * FRICTION
     assert np.median(abs(missing.force - held)) < 0.1 * np.median(abs(missing.force))
 
@@ -78,6 +80,6 @@ def test_without_rows_nothing_is_told(touching):
     chain.trajectory = replace(chain.trajectory, free=free)
     missing = MissingForce(chain, {})
     start = Starts(world, {}, usual).of([world.candidate("mass", "arm")])[0]
-    assert not len(missing.rows) and missing.basis(start) is None
+    assert not len(missing.rows) and missing.basis(start) is None and missing.scores({}) is None
     columns = Columns(chain, {}, [start])
     assert Beam(columns, columns.evidence(), missing).nodes()

@@ -39,6 +39,8 @@ def chosen(monkeypatch, fitted, losses):
 
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
+    silent = SimpleNamespace(scores=lambda *settings: None)
+    monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
     monkeypatch.setattr(rivals, "_late", lambda *args: [])
     start = Judge().fit({names[fitted]: (2.0,)})
     found, told = rivals.classes([DRY, CURVED], Judge(), None, start)
