@@ -16,6 +16,7 @@ from diagnosis.selection.starts import Starts
 
 STEPS = 6  # Gauss-Newton steps of a refit, at most
 DONE = 2e-3  # loss that another step would still remove, from which on a refit is done
+TRUE = 0.5  # of what columns tell of a step, by which it may differ and they are carried along
 THIRDS = 3  # shares of a step that are tried
 
 
@@ -59,18 +60,18 @@ class Judge:
     def fit(self, setting, steps=STEPS):
         """The Fitted values of a set of effects, begun at the values given.
 
-        Columns are carried along from step to step, and simulated again where they lower the loss
-        no more and at the end: of a set of many effects they are most of the time.
+        Columns are carried along with steps that do what they told, and simulated again after
+        others, where they lower the loss no more, and at the end: of a set of many effects they are
+        most of the time.
         """
         columns, carried = self._columns({c: self._inside(c, v) for c, v in setting.items()}), False
         while steps:
-            better = self._better(columns)
-            if better:
-                columns, carried, steps = columns.about(*better), True, steps - 1
-            elif carried:
-                columns, carried = self._columns(columns.setting, columns.residual), False
-            else:
+            better, as_told = self._better(columns)
+            if not better and not carried:
                 break
+            moved = better or (columns.setting, columns.residual)
+            carried, steps = as_told, steps - bool(better)
+            columns = columns.about(*moved) if carried else self._columns(*moved)
         if carried:
             columns = self._columns(columns.setting, columns.residual)
         evidence = columns.evidence(self.reference)
@@ -85,32 +86,34 @@ class Judge:
         return Columns(self.ahead, setting, starts, residual, self.seen)
 
     def _better(self, columns):
-        """(setting, residual) after a step from a setting that its Columns lower the loss with, or
-        None."""
+        """((setting, residual) after a step from a setting that its Columns lower the loss with, or
+        None; whether it did so by about as much as they told)."""
         evidence = columns.evidence(self.reference)
         index, *rest = problem(columns, range(len(columns.options)))
         amounts, now = evidence.score(index, *rest).amounts, evidence.plain()
-        if now - evidence.plain(index, amounts) <= DONE:
-            return None
+        told = now - evidence.plain(index, amounts)
+        if told <= DONE:
+            return None, False
         now += self._prior(columns.setting, evidence)
-        return self._lower(columns, evidence, amounts, now)
+        better, gained = self._lower(columns, evidence, amounts, now)
+        return better, abs(gained - told) < TRUE * told
 
     def _lower(self, columns, evidence, amounts, now):
-        """(setting, residual) after a step that lowers the loss from what it is now by more than
-        DONE, or None: of the whole step and thirds of it, the first that is better than the
-        next."""
-        least, best, share = now - DONE, None, 1.0
+        """((setting, residual) after a step that lowers the loss from what it is now by more than
+        DONE, or None; by how much): of the whole step and thirds of it, the first that is better
+        than the next."""
+        best, most, share = None, DONE, 1.0
         for _ in range(THIRDS):
             moved = moved_setting(columns, share * amounts)
             share /= 3
             if np.isfinite(self.cost(moved)):
                 residual = self.ahead.residual([moved])[0]
-                found = self._whole(residual, moved, evidence)
-                if found < least:
-                    least, best = found, (moved, residual)
+                gained = now - self._whole(residual, moved, evidence)
+                if gained > most:
+                    best, most = (moved, residual), gained
                 elif best:
                     break
-        return best
+        return best, most
 
     def _whole(self, residual, setting, evidence):
         """Loss of a residual with nothing left out, priors included."""

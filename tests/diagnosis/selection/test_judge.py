@@ -140,8 +140,42 @@ def test_a_step_is_taken_as_far_as_it_lowers_the_loss(monkeypatch, losses, taken
     judge.cost = lambda share: 0.0
     judge._whole = lambda residual, setting, evidence: shares.get(residual, 0.0)
     monkeypatch.setattr("diagnosis.selection.judge.moved_setting", lambda columns, share: share)
-    found = judge._lower(SimpleNamespace(residual=0.0), None, 1.0, 0.0)
+    found, gained = judge._lower(SimpleNamespace(residual=0.0), None, 1.0, 0.0)
     assert (found and found[0]) == taken
+    assert taken is None or gained == -shares[taken]
+
+
+@pytest.mark.parametrize(
+    "turns, simulated",
+    [
+        ([("a", True), ("b", True)], ["", "b"]),  # carried along, and anew at the end
+        ([("a", False), ("b", False)], ["", "a", "b"]),  # they told of other steps than these
+        ([("a", True), (None, False), (None, False)], ["", "a"]),  # told nothing: asked anew
+        ([(None, False)], [""]),
+    ],
+)
+def test_columns_are_carried_along_with_steps_that_do_what_they_told(turns, simulated):
+    judge, turns, asked = object.__new__(Judge), iter(turns), []
+
+    def about(setting, residual=None):
+        score = SimpleNamespace(plus=lambda *prior: None)
+        told = SimpleNamespace(reference=None, number=1, score=lambda *given: score)
+        columns = SimpleNamespace(setting=setting, residual=residual, options=[])
+        columns.evidence, columns.about = lambda reference: told, about
+        return columns
+
+    def columns_of(setting, residual=None):
+        asked.append("".join(setting))
+        return about(setting, residual)
+
+    def better(columns):
+        step, as_told = next(turns)
+        return step and ({step: (1.0,)}, "known"), as_told
+
+    judge.reference, judge._columns, judge._better = None, columns_of, better
+    judge.cost = lambda setting: 0.0
+    judge.fit({}, steps=2)
+    assert asked == simulated
 
 
 def test_a_late_sensor_is_told_beside_a_late_drive():
