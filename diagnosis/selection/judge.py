@@ -96,7 +96,7 @@ class Judge:
             return None, False
         now += self._prior(columns.setting, evidence)
         better, gained = self._lower(columns, evidence, amounts, now)
-        return better, abs(gained - told) < TRUE * told
+        return better, better is not None and abs(gained - told) < TRUE * told
 
     def _lower(self, columns, evidence, amounts, now):
         """((setting, residual) after a step that lowers the loss from what it is now by more than
