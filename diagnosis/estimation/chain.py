@@ -17,10 +17,13 @@ from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import Ahead
 from diagnosis.simulation.rows import RowMap, coarse
 
+ASTRAY = 1e3  # times its travel, to where a chain of transitions at stiff stops may run away
+
 
 class Chain(Ahead):
     """An Ahead whose predictions are linear in what happens in each row. Windows in which something
-    touches, and effects with states or sensors of their own, are simulated as in Ahead."""
+    touches or the chain runs away, and effects with states or sensors of their own, are simulated
+    as in Ahead."""
 
     def start(self, trajectory, setting=None):
         super().start(trajectory, setting)
@@ -31,7 +34,11 @@ class Chain(Ahead):
         self.rows = first[:, None] + np.minimum(ahead, last[:, None])
         follows = ahead[:-1] < last[:, None]
         self.begin = np.unique(self.rows[:, :-1][follows])
-        touched = (trajectory.free[self.rows[:, :-1]] & follows).any(1)
+        self.whole = self._begun(self.windows)
+        self.carried, touched = follows, (trajectory.free[self.rows[:, :-1]] & follows).any(1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            near = abs(self._carried_starts()) < ASTRAY * self.whole.travel[:, None]
+        touched |= ~near.all((1, 2, 3))
         self.carried, self.touched = follows & ~touched[:, None], np.flatnonzero(touched)
         self.used = np.unique(self.rows[:, :-1][self.carried])
         beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
@@ -40,7 +47,6 @@ class Chain(Ahead):
         self.coarse, self.base = coarse(self.world, trajectory.first), self.plain(self.base)
         rough = self._rows({**self.coarse, **self.base}, self.begin)
         self.finer, self.beyond = self._rows(self.base, self.begin) - rough, {}
-        self.whole = self._begun(self.windows)
         self.contacts = self._begun([self.windows[i] for i in self.touched])
         self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
 
@@ -73,16 +79,21 @@ class Chain(Ahead):
 
     def _moved_starts(self):
         """As of Ahead, along the chain."""
+        out = self._carried_starts()
+        if self.contacts:
+            rest = self.contacts.freedom()
+            out[self.touched] = 0.0
+            out[self.touched, : rest.shape[1]] = rest
+        return out
+
+    def _carried_starts(self):
+        """Those of windows that are carried along the chain."""
         nv, T = self.model.nv, self.rows.shape[1]
         out = np.zeros((*self.known.shape, 2 * nv))
         x = self.spread[:, None] * np.eye(2 * nv)
         for t in range(T - 1):
             x = self.trajectory.transition[self.rows[:, t]] @ x * self.carried[:, t, None, None]
             out[:, t + 1] = np.where(self.known[:, t + 1, :, None], x[:, :nv], 0.0)
-        if self.contacts:
-            rest = self.contacts.freedom()
-            out[self.touched] = 0.0
-            out[self.touched, : rest.shape[1]] = rest
         return out
 
     def _along(self, settings, out):

@@ -95,9 +95,10 @@ class Columns:
         changes = []
         for k in range(0, len(settings), TOGETHER):
             for gap in self.ahead.residual(settings[k : k + TOGETHER]):
-                change = self.residual - gap
-                change[self.lost | (abs(gap) >= self.ahead.travel)] = 0.0
-                changes.append(change.astype(np.float32))
+                with np.errstate(over="ignore"):
+                    change = (self.residual - gap).astype(np.float32)
+                gone = self.lost | (abs(gap) >= self.ahead.travel) | ~np.isfinite(change)
+                changes.append(np.where(gone, np.float32(0.0), change))
         self.simulated += len(settings)
         changes = iter(changes)
         for start in starts:

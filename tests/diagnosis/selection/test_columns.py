@@ -110,3 +110,21 @@ def test_amplitudes_are_begun_at_forces_that_the_machine_has(scene):
         for option in columns_of(scene, [candidate]).options:
             begun = option.base[0] + option.directions[0, 0]
             assert begun == pytest.approx(0.1 * prior.scale[0]), name
+
+
+@pytest.mark.parametrize("runs_away_to", [np.nan, np.inf, 1e60])
+def test_what_runs_away_in_some_windows_leaves_all_columns_finite(scene, monkeypatch, runs_away_to):
+    world, ahead, usual = scene
+    damping, mass = world.candidate("viscous_damping", "pivot"), world.candidate("mass", "arm")
+    predicted = ahead.residual
+
+    def residual(settings):
+        out = predicted(settings)
+        out[[mass in setting for setting in settings], :3] = runs_away_to
+        return out
+
+    monkeypatch.setattr(ahead, "residual", residual)
+    monkeypatch.setattr(ahead, "travel", np.full(1, np.inf))  # as of a Chain without contact
+    columns = columns_of(scene, [damping, mass])
+    assert {o.candidate for o in columns.options} == {damping, mass}
+    assert np.isfinite(columns.array).all()
