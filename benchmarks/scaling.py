@@ -4,7 +4,8 @@
 
 Arms of one to six hinges, moved by sums of sines, with viscous damping at the first hinge that the
 nominal model lacks. One thing is varied at a time: the recording's length, the number of joints,
-and the share of the catalogue that is looked at (every n-th candidate beside the right one).
+and the share of the catalogue that is looked at (every n-th candidate beside the right one and the
+time step).
 seconds: of the processor, one thread, from recordings in memory to the findings.
 """
 
@@ -86,8 +87,8 @@ def measured(seconds, joints, every, commit):
     xml = arm(joints)
     world = World(mujoco.MjSpec.from_string(xml))
     right = world.candidate("viscous_damping", "joint0")
-    rest = [c for c in world.candidates if c != right]
-    world.candidates = [right, *rest[::every]]
+    kept = [right, world.candidate("time_step", "world")]  # the second is asked for in any case
+    world.candidates = kept + [c for c in world.candidates if c not in kept][::every]
     train, held = recorded(xml, seconds, 0), recorded(xml, max(5, seconds // 4), 1)
     begun = time.process_time()
     found = identify(world, [train], [held]).summary["findings"]
