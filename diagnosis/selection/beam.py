@@ -123,11 +123,10 @@ class Beam:
             return start
         best, grown = None, [self.node(start.options, self.missing)]
         while grown and (best is None or grown[0].loss < best.loss - LEAST):
-            best, options = grown[0], self.columns.options
-            held = {options[k].candidate for k in best.options}
-            others = [k for k in self.free if options[k].candidate not in held]
-            others = [k for k in others if not self._unnamed(k)]
-            grown = [self.node((*best.options, k), self.missing) for k in others]
+            best, held = grown[0], self._candidates(grown[0])
+            others = [k for k in self.free if self.columns.options[k].candidate not in held]
+            named = [k for k in others if not self._unnamed(k)]
+            grown = [self.node((*best.options, k), self.missing) for k in named]
             grown.sort(key=lambda n: n.loss)
         return self.node(best.options)
 
@@ -140,9 +139,11 @@ class Beam:
         """The best node of each set of candidates, best first."""
         best = {}
         for node in sorted(nodes, key=lambda n: n.unpriced):
-            candidates = frozenset(self.columns.options[k].candidate for k in node.options)
-            best.setdefault(candidates, node)
+            best.setdefault(self._candidates(node), node)
         return list(best.values())
+
+    def _candidates(self, node):
+        return frozenset(self.columns.options[k].candidate for k in node.options)
 
     def _reduced(self, node, start, met):
         """Meet the sets that are left when effects go again, the one that is missed least first,
@@ -163,8 +164,7 @@ class Beam:
         """{k: nats} that options of effects which a node does not hold promise, in a first look."""
         index, *_, precision, _ = problem(self.columns, node.options)
         gain = self.evidence.looks(index, node.score.amounts, precision)
-        options = self.columns.options
-        held = {options[k].candidate for k in node.options}
+        options, held = self.columns.options, self._candidates(node)
         return {
             k: gain[list(o.columns)].sum() for k, o in enumerate(options) if o.candidate not in held
         }

@@ -65,18 +65,18 @@ class Judge:
         most of the time.
         """
         columns, carried = self._columns({c: self._inside(c, v) for c, v in setting.items()}), False
-        while steps:
-            better, as_told = self._better(columns)
+        while True:
+            evidence = columns.evidence(self.reference)
+            index, *rest = problem(columns, range(len(columns.options)))
+            score, better, as_told = evidence.score(index, *rest), None, False
+            if steps:
+                better, as_told = self._better(columns, evidence, index, score.amounts)
             if not better and not carried:
                 break
             moved = better or (columns.setting, columns.residual)
             carried, steps = as_told, steps - bool(better)
             columns = columns.about(*moved) if carried else self._columns(*moved)
-        if carried:
-            columns = self._columns(columns.setting, columns.residual)
-        evidence = columns.evidence(self.reference)
         self.reference = evidence.reference
-        score = evidence.score(*problem(columns, range(len(columns.options))))
         score = score.plus(self.cost(columns.setting), evidence.number)
         return Fitted(columns.setting, score, columns, evidence)
 
@@ -85,12 +85,10 @@ class Judge:
         starts = Starts(self.ahead.world, setting, self.usual, self.seen).of(setting)
         return Columns(self.ahead, setting, starts, residual, self.seen)
 
-    def _better(self, columns):
+    def _better(self, columns, evidence, index, amounts):
         """((setting, residual) after a step from a setting that its Columns lower the loss with, or
-        None; whether it did so by about as much as they told)."""
-        evidence = columns.evidence(self.reference)
-        index, *rest = problem(columns, range(len(columns.options)))
-        amounts, now = evidence.score(index, *rest).amounts, evidence.plain()
+        None; whether it did so by about as much as they told). amounts (p,): of columns index."""
+        now = evidence.plain()
         told = now - evidence.plain(index, amounts)
         if told <= DONE:
             return None, False

@@ -72,8 +72,12 @@ class MissingForce:
         """(n, nv): what a candidate of a plain setting holds, worked out once for its values."""
         key = candidate, plain[candidate]
         if key not in self.added:
-            self.added[key] = self.force - self._force(plain) * self.weight
+            self.added[key] = self._held(plain)
         return self.added[key]
+
+    def _held(self, plain):
+        """(n, nv): what a plain setting holds beyond that of this force."""
+        return self.force - self._force(plain) * self.weight
 
     def evidence(self, starts):
         """The Evidence of the force and of what Starts hold of it, all their directions in turn."""
@@ -91,8 +95,7 @@ class MissingForce:
         """[Score] of the force that settings lack, or None where no row tells."""
         if not len(self.rows):
             return None
-        plain = [self.chain.plain(setting) for setting in settings]
-        held = [self.force - self._force(p) * self.weight for p in plain]
+        held = [self._held(self.chain.plain(setting)) for setting in settings]
         evidence = self._evidence(np.stack([self.force, *held], -1))
         return [evidence.at([k], np.ones(1)) for k in range(len(held))]
 

@@ -158,7 +158,7 @@ def test_columns_are_carried_along_with_steps_that_do_what_they_told(turns, simu
     judge, turns, asked = object.__new__(Judge), iter(turns), []
 
     def about(setting, residual=None):
-        score = SimpleNamespace(plus=lambda *prior: None)
+        score = SimpleNamespace(plus=lambda *prior: None, amounts=())
         told = SimpleNamespace(reference=None, number=1, score=lambda *given: score)
         columns = SimpleNamespace(setting=setting, residual=residual, options=[])
         columns.evidence, columns.about = lambda reference: told, about
@@ -168,7 +168,7 @@ def test_columns_are_carried_along_with_steps_that_do_what_they_told(turns, simu
         asked.append("".join(setting))
         return about(setting, residual)
 
-    def better(columns):
+    def better(columns, *given):
         step, as_told = next(turns)
         return step and ({step: (1.0,)}, "known"), as_told
 
@@ -181,17 +181,14 @@ def test_columns_are_carried_along_with_steps_that_do_what_they_told(turns, simu
 @pytest.mark.parametrize(
     "gained, as_told", [(1.0, True), (0.4, False), (1.6, False), (None, False)]
 )
-def test_a_step_that_lowers_nothing_does_not_do_what_it_told(monkeypatch, gained, as_told):
-    monkeypatch.setattr("diagnosis.selection.judge.problem", lambda columns, chosen: ([0],))
+def test_a_step_that_lowers_nothing_does_not_do_what_it_told(gained, as_told):
     judge, plain = object.__new__(Judge), iter((2.0, 1.0))
-    evidence = SimpleNamespace(
-        score=lambda index: SimpleNamespace(amounts=np.ones(1)), plain=lambda *given: next(plain)
-    )
-    judge.reference, judge._prior = None, lambda setting, evidence: 0.0
+    evidence = SimpleNamespace(plain=lambda *given: next(plain))
+    judge._prior = lambda setting, evidence: 0.0
     step = (None, 1.0) if gained is None else (({}, None), gained)
     judge._lower = lambda *given: step
-    columns = SimpleNamespace(options=(), setting={}, evidence=lambda reference: evidence)
-    assert judge._better(columns) == (step[0], as_told)
+    columns = SimpleNamespace(setting={})
+    assert judge._better(columns, evidence, [0], np.ones(1)) == (step[0], as_told)
 
 
 def test_a_late_sensor_is_told_beside_a_late_drive():
