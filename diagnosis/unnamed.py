@@ -18,15 +18,6 @@ UNNAMED = 2  # units of complexity of a force where nothing has a name
 MOST = 3  # names that an unknown force may have
 
 
-def sizes(trajectory, dofs):
-    """(RMS of the force located in dofs (n,), how far it scatters), where nothing touches."""
-    rows = ~trajectory.free
-    if not rows.any():
-        return np.zeros(len(dofs)), np.ones(len(dofs))
-    force, deviation = trajectory.force[rows][:, dofs], trajectory.force_sd[rows][:, dofs]
-    return np.sqrt(np.mean(force**2, 0)), np.sqrt(np.mean(deviation**2, 0))
-
-
 def left(fitted):
     """Share (n,) of the error beyond the noise that a Fitted set leaves in each channel, start
     states free; NaN where the nominal model errs by no more than the noise."""
@@ -47,8 +38,8 @@ def _standing_out(world, outcome, joints):
     if not joints:
         return None
     dofs = world.model.jnt_dofadr[joints]
-    force, scatter = sizes(outcome.found.first, dofs)
-    return world.model.joint(joints[int(np.argmax(force / scatter))]).name
+    force, scatter = outcome.found.first.located()
+    return world.model.joint(joints[int(np.argmax((force / scatter)[dofs]))]).name
 
 
 def main_joint(world, outcome, candidate, shares):

@@ -111,7 +111,7 @@ class Effect:
         0  # of an effect with probes: how many of its first parameters it acts in proportion to
     )
     together = 1  # of an effect with probes: how many in a row are tried as one
-    simplicity = 1  # 0 for the first things to think of, up to 3
+    simplicity = 1  # 0 for the first things to think of, up to 3; -1 for what is no physics
     related = ()  # names of effects at the same joint in whose wrong value this one may hide
 
     def __repr__(self):

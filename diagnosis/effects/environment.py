@@ -92,9 +92,11 @@ class AirDrag(Effect):
 @catalogue
 class TimeStep(Effect):
     """The simulator's own integration step, s: what it leaves out is no physics, and in every
-    simulator."""
+    simulator. With another step Euler's method is implicit in the speeds of drives as it is in
+    those of joints: or the same damping would differ by where it is."""
 
-    name, kinds, simplicity = "time_step", ("world",), 0
+    # no physics that a name could be spent on: it costs nothing, and all else is compared with it
+    name, kinds, simplicity = "time_step", ("world",), -1
 
     def parameters(self, model, i):
         h = model.opt.timestep
@@ -105,11 +107,17 @@ class TimeStep(Effect):
         return model.opt.timestep / np.array([[2.0]])
 
     def edit(self, model, i, values):
-        model.opt.timestep = values[0]
+        self._set(model.opt, values)
 
     def write(self, spec, model, i, values):
-        spec.option.timestep = values[0]
+        self._set(spec.option, values)
         return "mjcf"
+
+    @staticmethod
+    def _set(option, values):
+        option.timestep = values[0]
+        if option.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+            option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
 # ---------------------------------------------------------------- contacts

@@ -65,6 +65,14 @@ class Trajectory:
         """The slice of a recording's rows."""
         return slice(self.first[recording], self.first[recording] + len(recording.time))
 
+    def located(self):
+        """(RMS (nv,) of the force, and of its standard deviation), where nothing touches."""
+        rows = ~self.free
+        if not rows.any():
+            return np.zeros(self.force.shape[1]), np.ones(self.force.shape[1])
+        size = lambda force: np.sqrt(np.mean(force[rows] ** 2, 0))
+        return size(self.force), size(self.force_sd)
+
 
 class Smoother:
     """Smooths recordings under any setting. position_noise, velocity_noise (nv,): standard

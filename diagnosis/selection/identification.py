@@ -61,7 +61,7 @@ class Identification:
         self.say(0.0, "locating the missing force")
         self.smoother = smoother = Smoother(self.world, self.train)
         first = trajectory = smoother.locate({})
-        self.usual = Usual(self.world, self.train, smoother.scale)
+        self.usual = Usual(self.world, self.train, smoother.scale, first.located()[0])
         self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
         self.screen = Chain(self.world, self.ahead.windows, smoother.position_noise)
         setting, ranking = {}, []

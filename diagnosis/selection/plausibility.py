@@ -11,6 +11,7 @@ import numpy as np
 from diagnosis.effects.actuators import ActuatorEffect
 from diagnosis.effects.base import joints_of
 from diagnosis.effects.bodies import size_of
+from diagnosis.effects.unmodelled import asked
 from diagnosis.estimation import windowing
 
 TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
@@ -18,6 +19,7 @@ TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 # of each effect: (unit, scale, low, high), one row for all its parameters, or one for each. Units:
 #   plain: the parameter's own                  times: the nominal value
 #   force: what is usual in the joint           inertia: what the joint moves
+#   missing: what the nominal model lacks in the joint, over the size of what a curve is times
 #   per speed, per travel: so much force at the joint's usual speed, or travel
 #   travel: the joint's recorded range          size, weight: the body's
 #   used, strength: the largest force that the controls ask for
@@ -77,6 +79,7 @@ TABLE = {
     "presliding": [("force", 0.7, 0.0, 3.0), ("plain", np.inf, 0.0, np.inf)],
     "coupled_inertia": [("inertia", 0.5, 0.0, 20.0)],
     "gain_fade": [("plain", 0.05, 0.0, 0.5)],
+    "unknown": [("missing", 3.0, -20.0, 20.0)],
 }
 AWAY = (
     "gravity",
@@ -119,9 +122,11 @@ class Usual:
     """What a machine usually does: force (nv,), speed (nv,) and travel (nv,) of each dof, forces
     asked of actuators."""
 
-    def __init__(self, world, recordings, force):
+    def __init__(self, world, recordings, force, missing=None):
+        """missing (nv,): RMS of the force that the nominal model lacks, where it is located."""
         model = world.model
         states = [windowing.states(model, r) for r in recordings]
+        self.states, self.missing = states, missing
         qvel = np.concatenate([v for _, v in states])
         gone = [
             windowing.difference(model, np.broadcast_to(model.qpos0, q.shape), q) for q, _ in states
@@ -160,6 +165,8 @@ class Usual:
             return max(used, 1e-9) / (abs(model.actuator_gainprm[i, 0]) if motor else 1.0)
         if d is None:
             return np.inf
+        if kind == "missing":
+            return np.inf if self.missing is None else self.missing[d] / self._times(candidate)
         gear = 1.0
         if place.kind == "actuator":
             gear = abs(model.actuator_gear[model.actuator(place.name).id, 0]) or 1.0
@@ -172,6 +179,16 @@ class Usual:
             "per travel³": self.force[d] / self.travel[d] ** 3,
             "travel": self.range[d],
         }[kind]
+
+    def _times(self, curve):
+        """RMS of what a curve is multiplied by."""
+        kind, _, name = (curve.effect.factor or "").partition(":")
+        if kind != "control":
+            return 1.0
+        i = self.model.actuator(name).id
+        each = zip(self.states, self.recordings)
+        told = np.concatenate([asked(self.model, i, q, v, r.ctrl) for (q, v), r in each])
+        return np.sqrt(np.nanmean(told**2)) + 1e-9
 
 
 def plausible(candidate, usual):

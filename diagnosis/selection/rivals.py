@@ -56,9 +56,11 @@ def _members(candidates, judge, chain, fitted, candidate):
     near = _alike(judge, missing, fitted, candidate, pool)
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
-        good = tried.settled and (_tied(tried.score, fitted.score) or tried.loss < fitted.loss)
-        lacks = good and missing.scores(tried.setting, fitted.setting)
-        if good and (lacks is None or _tied(*lacks)):
+        if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
+            continue
+        tried = judge.fit(tried.setting)  # forces tell values better than the motion
+        lacks = missing.scores(tried.setting, fitted.setting)
+        if lacks is None or _tied(*lacks):
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 

@@ -144,7 +144,8 @@ def _proportional(candidate, base, prior, shown):
     """The Start of small steps of the parameters that show, or None."""
     steps = np.array([p.step for p in candidate.parameters])
     steps = np.where((base + steps > prior.high) | ~np.isfinite(steps), -abs(steps), steps)
-    fits = (base + steps >= prior.low) & np.isfinite(base) & shown
+    steps = np.where(base + steps < prior.low, abs(steps), steps)
+    fits = (base + steps <= prior.high) & (base + steps >= prior.low) & np.isfinite(base) & shown
     if not fits.any():
         return None
     ends = np.stack([(prior.low - base) / steps, (prior.high - base) / steps])

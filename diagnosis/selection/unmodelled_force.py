@@ -20,7 +20,7 @@ BLOCKS = 16  # stretches of time that are left out in turn
 # share of the located force's variance, predicted on stretches left out, that a curve must explain
 LEAST = 0.03
 # periods over the travel, or a recording, from, to and by, of forces that come and go
-WAVES = 4.0, 30.0, 0.1
+WAVES = 1.0, 30.0, 0.1
 SAMPLED = 2000  # rows in which these are looked for
 CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 
@@ -49,13 +49,15 @@ class Curve:
 
 
 def dependences(world, trajectory, recordings, most=4):
-    """The Dependences of the located force of every hinge and slide, the largest share first."""
+    """The Dependences of the located force of every hinge and slide, first those that stand out
+    most of how far it scatters: where little is known of a force, what is located is smooth, and
+    any curve over time follows it."""
     model, found = world.model, []
     ctrl = np.concatenate([r.ctrl for r in recordings])
     time = np.concatenate([r.time for r in recordings])
     keep = ~trajectory.free & np.isfinite(trajectory.force).all(1)
     block = np.arange(keep.sum()) * BLOCKS // max(keep.sum(), 1)
-    axes = _axes(model, trajectory, ctrl, time)
+    axes, scatter = _axes(model, trajectory, ctrl, time), trajectory.located()[1]
     for j in range(model.njnt):
         if model.jnt_type[j] not in (HINGE, SLIDE) or keep.sum() < 10 * KNOTS:
             continue
@@ -72,9 +74,9 @@ def dependences(world, trajectory, recordings, most=4):
                         candidate = world.curve(name, variable, curve.knots, factor, wave)
                         told = (variable,) + ((factor,) if factor else ())
                         values = tuple(map(float, curve.values))
-                        each = name, told, curve.share, curve.rms, candidate, values
-                        found.append(Dependence(*each))
-    return sorted(found, key=lambda f: -f.share)[:most]
+                        each = Dependence(name, told, curve.share, curve.rms, candidate, values)
+                        found.append((curve.rms / scatter[d], each))
+    return [each for _, each in sorted(found, key=lambda pair: -pair[0])][:most]
 
 
 def _axes(model, trajectory, ctrl, time):

@@ -8,6 +8,7 @@ import pytest
 from arm import ARM, run
 
 from diagnosis import unnamed
+from diagnosis.estimation.smoother import Trajectory
 from diagnosis.recordings.recording import Recording
 from diagnosis.selection.criterion import PRICE
 from diagnosis.selection.plausibility import Usual, plausible
@@ -28,7 +29,9 @@ def smoothed(elbow, shoulder=0.0, scatter=0.1):
     """A trajectory with forces of these RMS values at two joints, each known to the scatter."""
     force = np.array([[shoulder, elbow], [-shoulder, -elbow]])
     free = np.zeros(2, bool)
-    return SimpleNamespace(force=force, force_sd=np.full((2, 2), scatter), free=free)
+    none = np.zeros((2, 2))
+    sd = np.full((2, 2), scatter)
+    return Trajectory(none, none, force, none, none, sd, {}, free, none)
 
 
 def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)):

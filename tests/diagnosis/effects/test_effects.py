@@ -132,9 +132,10 @@ def test_all_effects_together_are_the_same_in_mjcf(case):
 )
 def test_what_is_written_by_the_time_step_is_by_the_corrected_one(kind, effect, place, values):
     """Beside a finer time step an effect is written as into a model that had it from the
-    beginning."""
+    beginning, and a method that is implicit in the speeds of drives."""
     world, xml = arm(kind)
-    fine = World(mujoco.MjSpec.from_string(xml.replace('timestep="0.002"', 'timestep="0.001"')))
+    finer = xml.replace('timestep="0.002"', 'timestep="0.001"').replace("Euler", "implicitfast")
+    fine = World(mujoco.MjSpec.from_string(finer))
     together = {
         world.candidate(effect, place): values,
         world.candidate("time_step", "world"): (0.001,),

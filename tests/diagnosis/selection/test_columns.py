@@ -128,3 +128,12 @@ def test_what_runs_away_in_some_windows_leaves_all_columns_finite(scene, monkeyp
     columns = columns_of(scene, [damping, mass])
     assert {o.candidate for o in columns.options} == {damping, mass}
     assert np.isfinite(columns.array).all()
+
+
+def test_a_step_that_would_leave_its_bounds_goes_the_other_way(scene):
+    world, _, usual = scene
+    step = world.candidate("time_step", "world")
+    for h in (step.nominal[0], 0.3 * step.nominal[0], 0.25 * step.nominal[0]):
+        [start] = Starts(world, {step: (h,)}, usual).of([step])
+        prior = plausible(step, usual)
+        assert prior.inside(start.base + start.directions[0]) and start.directions[0, 0] != 0

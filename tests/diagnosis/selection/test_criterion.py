@@ -234,6 +234,7 @@ def test_what_is_farther_from_the_first_things_to_think_of_and_freer_is_more_com
     assert of("gain") < of("armature") < of("dead_zone") < of("stribeck_friction")
     assert of("stribeck_friction") < complexity([curve])
     assert complexity([curve]) == 8
+    assert of("time_step") == 0  # no physics
 
 
 def test_a_fit_is_the_best_of_several_minima():

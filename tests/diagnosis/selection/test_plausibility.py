@@ -88,3 +88,15 @@ def test_only_a_bound_of_what_is_plausible_is_a_limit_beyond_which_the_truth_may
     ends = plausible(gain, usual)
     assert at_limit(gain, ends.low, ends) and at_limit(gain, ends.high, ends)
     assert not at_limit(gain, ends.centre, ends)
+
+
+def test_a_force_without_a_name_is_about_as_large_as_what_is_missing():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    run = recorded("run.csv", 0)
+    usual = Usual(world, [run], np.array([0.5]), missing=np.array([0.02]))
+    curve = world.curve("pivot", "position:pivot", (0.0, 1.0))
+    times = world.curve("pivot", "position:pivot", (0.0, 1.0), "control:drive")
+    assert plausible(curve, usual).scale == pytest.approx([0.06, 0.06])
+    asked = np.sqrt(np.mean(run.ctrl[:, 0] ** 2))
+    assert plausible(times, usual).scale == pytest.approx([0.06 / asked] * 2)
+    assert np.isinf(plausible(curve, Usual(world, [run], np.array([0.5]))).scale).all()

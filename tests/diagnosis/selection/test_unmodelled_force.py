@@ -52,14 +52,14 @@ def test_the_variable_of_a_force_is_named_with_its_curve(law, joint, variable):
     world, trajectory, runs = made_up(law)
     found = dependences(world, trajectory, runs)[0]
     assert (found.joint, found.variables[0]) == (joint, variable) and found.share > 0.8
-    knots, values = np.array(found.candidate.effect.knots), np.array(found.values)
+    values = np.array(found.values)
     q, v, u = trajectory.qpos, trajectory.qvel, runs[0].ctrl
     x = {"position:j": q[:, 0], "velocity:k": v[:, 1], "control:m": u[:, 0]}.get(
         variable, runs[0].time
     )
     dof = {"j": 0, "k": 1}[joint]
     if len(found.variables) == 1:
-        curve = np.interp(x, knots, values)
+        curve = found.candidate.effect.at(x, np.tile(values, (len(x), 1)))
         true = law(q, v, u, runs[0].time)[:, dof]
         assert np.sqrt(np.mean((curve - true) ** 2)) < 0.35 * np.sqrt(np.mean(true**2))
         assert found.size == pytest.approx(np.sqrt(np.mean(true**2)), rel=0.2)
@@ -79,6 +79,14 @@ def test_ripples_of_what_a_drive_is_asked_for_are_a_wave_times_its_control():
     assert found.candidate.effect.wave and np.pi / 2 / (quarter - zero) == pytest.approx(
         14, rel=0.02
     )
+
+
+def test_what_stands_out_of_what_is_known_comes_first():
+    law = lambda q, v, u, t: at(0, 0.3 * np.sin(4 * q[:, 0])) + at(1, np.sin(t / 3))
+    world, trajectory, runs = made_up(law)
+    assert dependences(world, trajectory, runs)[0].joint == "k"
+    trajectory.force_sd[:, 1] = 1.0  # as smooth, and as large as what is not known of it
+    assert dependences(world, trajectory, runs)[0].joint == "j"
 
 
 def test_noise_depends_on_nothing():
