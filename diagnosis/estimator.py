@@ -121,7 +121,7 @@ def _beside(search, judge, fitted, rest, price):
 def _classes(search, found, fitted, log, candidates):
     """(Fitted, {candidate: [(other, values)]}): the classes of its findings among candidates."""
     some = candidates, found.judge, found.chain, fitted
-    return rivals.classes(*some, log)
+    return rivals.classes(*some, search.begun, log)
 
 
 def _at(world, candidate, joint):

@@ -63,7 +63,7 @@ def floor_gaps(world, settings, smoother, trajectory, horizon=windowing.HORIZON)
     windows = sparse(consecutive(smoother.recordings, horizon))
     early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
     truth, speed = predict(world, settings, early, trajectory.at(early))
-    position_noise, velocity_noise = smoother.position_noise, smoother.velocity_noise
+    position_noise = smoother.position_noise
     finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
     every, at = (
         np.arange(len(windows)),
@@ -74,7 +74,7 @@ def floor_gaps(world, settings, smoother, trajectory, horizon=windowing.HORIZON)
     )
     known = windowing.known(model, windows)
     measured = np.array([np.isfinite(w.recording.qvel[w.first]) for w in windows])
-    spread, out = np.where(np.isfinite(velocity_noise), velocity_noise, 0.0), []
+    spread, out = _velocity_spread(smoother, trajectory), []
     for _ in range(DRAWS):
         noisy = windowing.integrate(
             model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,))
@@ -91,6 +91,18 @@ def floor_gaps(world, settings, smoother, trajectory, horizon=windowing.HORIZON)
             )
         )
     return np.concatenate(out)
+
+
+def _velocity_spread(smoother, trajectory):
+    """Standard deviation (nv,) of velocities as recorded. Filtered differences of positions have no
+    noise of their own: theirs is how far they are from the smoothed motion."""
+    noise, gaps = smoother.velocity_noise, []
+    for r in smoother.recordings:
+        gaps.append(r.qvel - trajectory.qvel[trajectory.rows(r)])
+    square = np.concatenate(gaps) ** 2
+    known = np.isfinite(square)
+    apart = np.sqrt(np.where(known, square, 0.0).sum(0) / np.maximum(known.sum(0), 1))
+    return np.where(np.isfinite(noise), noise, apart)
 
 
 def reporting_noise(position_noise):

@@ -4,6 +4,7 @@ found = Identification(world, train).run()
 found.fitted.setting; found.trajectory
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,7 +88,14 @@ class Identification:
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
         that misses."""
-        return Judge(self.ahead, self.usual, squares(self.ahead), self.seen)
+        self.reference = squares(self.ahead)
+        return Judge(self.ahead, self.usual, self.reference, self.seen)
+
+    def begun(self, setting):
+        """A Judge whose windows begin at the motion that is located under a setting."""
+        ahead = copy(self.ahead)
+        ahead.start(copy(self.smoother).locate(setting, self.trajectory, passes=2), setting)
+        return Judge(ahead, self.usual, self.reference, self.seen)
 
     def _round(self, setting, judge):
         """(Fitted, whether it holds other effects than there were, first ranking)."""
@@ -119,7 +127,7 @@ class Identification:
                 judged.append(judge.fit(fitted.inside, steps=3))
         best = self._choose(judged, now, number)
         if best is not now:
-            best = self.pruned(judge, self.further(judge, best))
+            best = self.pruned(judge, self.finer(judge, self.further(judge, best)))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         better = best.setting.keys() != setting.keys()
         return best, better, [] if setting else self._ranking(beam, start, nodes)
@@ -171,6 +179,15 @@ class Identification:
         the error of what they are fitted to."""
         more = judge.fit(fitted.setting)
         return more if more.settled and more.loss < fitted.loss else fitted
+
+    def finer(self, judge, fitted):
+        """Fitted beside a finer time step, if that is better: what made up for the simulator's own
+        goes when the set is pruned."""
+        step = self.world.candidate("time_step", "world")
+        if step in fitted.setting:
+            return fitted
+        more = judge.fit({**fitted.setting, step: tuple(p.low for p in step.parameters)}, steps=3)
+        return more if more.loss < fitted.loss else fitted
 
     def earned(self, before, after, number=1):
         """Whether a set is worth its complexity, and better by no chance among those looked at."""

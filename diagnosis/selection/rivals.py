@@ -23,9 +23,10 @@ FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
-def classes(candidates, judge, chain, fitted, log=lambda what: None):
+def classes(candidates, judge, chain, fitted, begun, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
-    its price, and the other members. Among equals the finding stays."""
+    its price, and the other members. Among equals the finding stays. begun(setting): a Judge whose
+    windows begin at the motion that is located under a setting."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting:
@@ -42,7 +43,7 @@ def classes(candidates, judge, chain, fitted, log=lambda what: None):
         others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
         told = {o for o, _ in others[own]}
         pool = [c for c in candidates if c not in told and c not in fitted.setting]
-        others[own] += _late(pool, judge, chain, fitted, own)
+        others[own] += _late(pool, begun, chain, fitted, own)
     others = {c: each[:MOST] for c, each in others.items() if c in fitted.setting}
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
@@ -51,7 +52,7 @@ def _members(candidates, judge, chain, fitted, candidate):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
     their price, best first, and against which the missing force does not speak."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    pool = [c for c in candidates if c not in fitted.setting and c.effect.name != "time_step"]
+    pool = [c for c in candidates if c not in fitted.setting]
     missing, out = MissingForce(chain, rest), []
     near = _alike(judge, missing, fitted, candidate, pool)
     for other, values in near[:REFITS]:
@@ -65,9 +66,9 @@ def _members(candidates, judge, chain, fitted, candidate):
     return sorted(out, key=lambda pair: pair[0].loss)
 
 
-def _late(pool, judge, chain, fitted, candidate):
+def _late(pool, begun, chain, fitted, candidate):
     """[(other, values)] of a delay in the drive for one in the sensor, or the other way round, that
-    predict as well: both begin at states of their own, for a late sensor shows others."""
+    predict as well: either begins at states of its own, for a late sensor shows others."""
     world = chain.world
     late = lambda c: (
         c.effect.overrides("measure") and c.effect.measure(np.ones(len(c.parameters)))[2] > 0
@@ -79,7 +80,8 @@ def _late(pool, judge, chain, fitted, candidate):
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     out = []
     for other in near:
-        tried = judge.fit({**rest, other: fitted.setting[candidate]})
+        held = {**rest, other: fitted.setting[candidate]}
+        tried = begun(held).fit(held)
         if tried.settled and _tied(tried.score, fitted.score):
             out.append((other, tried.setting[other]))
     return out

@@ -21,6 +21,9 @@ BLOCKS = 16  # stretches of time that are left out in turn
 LEAST = 0.03
 # periods over the travel, or a recording, from, to and by, of forces that come and go
 WAVES = 1.0, 30.0, 0.1
+SLOWEST = (
+    2.0  # radians of such a wave for each that a joint turns: with one, gravity comes and goes
+)
 SAMPLED = 2000  # rows in which these are looked for
 CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 
@@ -149,6 +152,7 @@ def _quarter(force, x, times):
     some = windowing.evenly(len(x), SAMPLED)
     low, high = np.quantile(x, [0.005, 0.995])
     number = np.arange(*WAVES) * 2 * np.pi / max(high - low, 1e-9)
+    number = number[number >= min(SLOWEST, number[-1])]
     turned = np.exp(1j * np.outer(number, x[some])) * times[some]
     like = abs(turned @ force[some]) / np.sqrt((abs(turned) ** 2).sum(1) + 1e-300)
     return np.array([0.0, np.pi / 2 / number[np.argmax(like)]])

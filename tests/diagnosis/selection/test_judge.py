@@ -101,7 +101,7 @@ def test_back_emf_and_viscous_damping_are_one_class():
     pool = [c for c in world.candidates if c.effect.name in names]
     for found in (damping, back_emf):
         fitted = judge.fit({found: (0.1,)})
-        again, others = rivals.classes(pool, judge, along(judge), fitted)
+        again, others = rivals.classes(pool, judge, along(judge), fitted, lambda setting: judge)
         [named] = again.setting
         told = {named, *(c for c, _ in others[named])}
         assert {damping, back_emf} <= told
@@ -118,7 +118,7 @@ def test_what_is_no_equal_is_not_told():
     fitted = judge.fit({friction: (0.05,)})
     others = "gain", "stiffness", "mass", "delay", "viscous_damping", "gravity", "bias"
     pool = [c for c in world.candidates if c.effect.name in others]
-    again, told = rivals.classes(pool, judge, along(judge), fitted)
+    again, told = rivals.classes(pool, judge, along(judge), fitted, lambda setting: judge)
     assert list(again.setting) == [friction]
     assert told[friction] == []
 
@@ -204,7 +204,8 @@ def test_a_late_sensor_is_told_beside_a_late_drive():
             setting=setting, settled=True, score=Score(losses[c], groups, 4 * groups, ())
         )
 
-    some = world.candidates, SimpleNamespace(fit=fit), SimpleNamespace(world=world)
+    begun = lambda setting: SimpleNamespace(fit=fit) if late in setting else None
+    some = world.candidates, begun, SimpleNamespace(world=world)
     losses = {delay: -1.0, late: -0.95}
     fitted = fit({delay: (0.01,)})
     assert rivals._late(*some, fitted, delay) == [(late, (0.01,))]

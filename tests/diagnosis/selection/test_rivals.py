@@ -43,7 +43,7 @@ def chosen(monkeypatch, fitted, losses):
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
     monkeypatch.setattr(rivals, "_late", lambda *args: [])
     start = Judge().fit({names[fitted]: (2.0,)})
-    found, told = rivals.classes([DRY, CURVED], Judge(), None, start)
+    found, told = rivals.classes([DRY, CURVED], Judge(), None, start, None)
     return [c.name for c in found.setting], {
         c.name: [o.name for o, _ in each] for c, each in told.items()
     }
