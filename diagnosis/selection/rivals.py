@@ -10,12 +10,11 @@ import numpy as np
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.first_look import likely
+from diagnosis.selection.judge import problem
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.starts import Starts
 
-# cosine of two effects' columns beside the other findings', from which on one may stand for the
-# other
-ALIKE = 0.7
+APART = 0.3  # share of an effect that another may leave in its place, as far as columns tell
 TIED = 0.1  # nats of log RMS error by which another member of a class may be worse
 CHANCE = 0.05  # p-value of that, above which it may be worse by any
 # how much more complex another member of a class may be: three components for one number
@@ -94,8 +93,8 @@ def _tied(tried, fitted):
 
 
 def _alike(judge, missing, fitted, candidate, pool):
-    """[(other, values)] with columns like the candidate's force beside the other findings', most
-    alike first.
+    """[(other, values)] that predict about as well in the candidate's place as far as columns tell,
+    the best first.
 
     Asked at the model without the finding, for what is gone there is what the others have to
     explain.
@@ -104,26 +103,21 @@ def _alike(judge, missing, fitted, candidate, pool):
     near = _near(chain.world, candidate, pool) + list(rest)
     starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory).of(near)
     columns = Columns(chain, rest, likely(missing, starts))
-    gone = columns.residual - chain.residual([fitted.setting])[0]
-    evidence = Evidence(chain, gone, columns.array)
-    kept = [k for k, o in enumerate(columns.options) if o.candidate in rest]
-    index = [i for k in kept for i in columns.options[k].columns]
-    bare = _left(evidence, index)
+    options, evidence = columns.options, columns.evidence(judge.reference)
+    kept = [k for k, o in enumerate(options) if o.candidate in rest]
+    gap = chain.residual([fitted.setting])[0]
+    gap = gap + APART * (columns.residual - gap)
+    most = Evidence(chain, gap, columns.array, judge.reference).score(*problem(columns, kept)).loss
     out = {}
-    for option in columns.options:
-        if option.candidate in rest:
-            continue
-        left = _left(evidence, [*index, *option.columns])
-        cosine = np.sqrt(max(1 - left / max(bare, 1e-300), 0.0))
-        if cosine < ALIKE:
-            continue
-        wide = np.full(len(option.columns), np.inf)
-        none = np.zeros(len(wide))
-        score = evidence.score(option.columns, -wide, wide, none, none)
-        values = option.values(np.clip(score.amounts, option.low, option.high))
-        if cosine > out.get(option.candidate, (0.0,))[0]:
-            out[option.candidate] = cosine, values
-    return [(c, v) for c, (_, v) in sorted(out.items(), key=lambda item: -item[1][0])]
+    for k in set(range(len(options))) - set(kept):
+        other, width = options[k].candidate, len(options[k].columns)
+        index, low, high, precision, pull = problem(columns, [*kept, k])
+        low[-width:], high[-width:] = -np.inf, np.inf  # its place in the set is not the start's
+        score = evidence.score(index, low, high, precision, pull)
+        if score.loss < min(most, out.get(other, (np.inf,))[0]):
+            amounts = np.clip(score.amounts[-width:], options[k].low, options[k].high)
+            out[other] = score.loss, options[k].values(amounts)
+    return [(c, v) for c, (_, v) in sorted(out.items(), key=lambda item: item[1][0])]
 
 
 def _near(world, candidate, pool):
@@ -139,14 +133,3 @@ def _near(world, candidate, pool):
         if other in related or mine is None or theirs is None or mine & theirs:
             out.append(other)
     return out
-
-
-def _left(evidence, columns):
-    """Weighted squares that columns leave of what is gone."""
-    none = np.zeros(0)
-    weight = evidence.weight(evidence.freed((), none), none)
-    whole = np.einsum("gc,gcij->ij", weight, evidence.freed(columns, np.zeros(len(columns))))
-    if not len(columns):
-        return whole[0, 0]
-    inside = whole[1:, 1:] + 1e-9 * np.diag(np.diag(whole)[1:])
-    return whole[0, 0] - whole[0, 1:] @ np.linalg.solve(inside, whole[1:, 0])
