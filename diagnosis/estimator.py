@@ -17,7 +17,13 @@ from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
 from diagnosis.selection.criterion import PRICE, complexity, paired
-from diagnosis.selection.identification import Found, Identification, changing, no_chance
+from diagnosis.selection.identification import (
+    Found,
+    Identification,
+    changing,
+    no_chance,
+    without,
+)
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
 from diagnosis.unnamed import INSTEAD, UNNAMED
@@ -169,7 +175,9 @@ def _hand_over(search, held, kept_back, outcome, log):
     if kept != setting:
         outcome.fitted = judge.fit(kept, steps=0)
     for c, v in kept.items():
-        less = judge.fit({other: x for other, x in kept.items() if other is not c}, steps=2)
+        less = without(outcome.fitted, c)
+        if np.isinf(less.loss):  # of what small changes tell nothing
+            less = judge.fit({other: x for other, x in kept.items() if other is not c}, steps=2)
         outcome.p_values[c] = paired(less.score, outcome.fitted.score).p_value
         outcome.strains[c] = _strain(c, v, plausible(c, found.usual))
     if set(kept) != set(found.fitted.setting):

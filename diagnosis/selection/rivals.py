@@ -25,10 +25,11 @@ REFITS, MOST = 4, 3  # others that are refitted, and told
 def classes(candidates, judge, chain, fitted, begun, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
     its price, and the other members. Among equals the finding stays. begun(setting): a Judge whose
-    windows begin at the motion that is located under a setting."""
+    windows begin at the motion that is located under a setting. A finer time step is no physics,
+    so nothing is asked for in its place."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
-        if candidate not in fitted.setting:
+        if candidate not in fitted.setting or candidate.effect.name == "time_step":
             continue
         members = _members(candidates, judge, chain, fitted, candidate)
         units, most = complexity(fitted.setting), fitted.loss - TIED
