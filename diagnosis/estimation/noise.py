@@ -8,20 +8,10 @@ import mujoco
 import numpy as np
 
 from diagnosis.estimation.windowing import channels, difference, joint_slices, pooled
+from diagnosis.recordings.quality import encoder_quantum
 
 # of differences: what a smooth motion leaves falls with the order, noise does not
 ORDERS = range(2, 9)
-
-
-def quantum(column):
-    """Smallest step of a reading (unit of column), if it only takes multiples of one; else 0."""
-    values = np.unique(column[np.isfinite(column)])
-    steps = np.diff(values)
-    if len(steps) < 3:
-        return 0.0
-    step = np.quantile(steps, 0.05)
-    off = abs(steps / step - np.rint(steps / step)) if step > 0 else np.ones(1)
-    return float(step) if np.mean(off < 0.05) > 0.95 and len(values) < 0.5 * len(column) else 0.0
 
 
 def difference_noise(time, column):
@@ -46,7 +36,7 @@ def difference_noise(time, column):
         best = min(estimates)
     if len(estimates) > 2:  # what still falls with the order is motion, and falls on
         best *= min(1.0, estimates[-1] / estimates[-3]) ** 2
-    step = quantum(column)
+    step = encoder_quantum(column)
     return max(best, step / np.sqrt(12)) if best or step else np.inf
 
 
