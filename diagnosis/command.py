@@ -36,7 +36,7 @@ from diagnosis.recordings import recording as recorded
 from diagnosis.recordings.cleaning import without_defects
 from diagnosis.recordings.column_map import load_layout
 from diagnosis.recordings.layout import Layout
-from diagnosis.recordings.quality import assess, told
+from diagnosis.recordings.quality import assess, evenly_stamped, told
 from diagnosis.report import text as wording
 from diagnosis.report import writer
 from diagnosis.report.per_recording import with_each_recording
@@ -82,8 +82,9 @@ def diagnose(
     world = with_gains(world, together(gains, train + held))
     assessed = [dataclasses.replace(r, quality=assess(r, world.model)) for r in train + held]
     given, notes = without_defects(assessed, world.model)
-    train, held = given[: len(train)], given[len(train) :]
     notes += plausibility.check(given, world.model)
+    given = [evenly_stamped(r) for r in given]
+    train, held = given[: len(train)], given[len(train) :]
     notes += _runs(world.model, given) + told(given, world.model)
     train, kept = _kept_back(train) if held else split(train)
     plausibility.enough(train)

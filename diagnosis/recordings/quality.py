@@ -11,7 +11,7 @@ interpolated from a slower rate.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import mujoco
@@ -77,6 +77,21 @@ def assess(recording, model: mujoco.MjModel) -> Quality:
     return Quality(quantum, differenced, period, jitter, even, skipped, rows_from)
 
 
+def evenly_stamped(recording):
+    """A recording of known Quality, at stamps of an even grid where its rows were taken evenly."""
+    quality, time = recording.quality, recording.time
+    if not quality.even or quality.jitter <= UNEVEN * quality.period:
+        return recording
+    rows = _rows(time)
+    return replace(recording, time=time[0] + rows * (time[-1] - time[0]) / rows[-1])
+
+
+def _rows(time):
+    """(T,) number of each row of an even grid, those that were left out counted."""
+    steps = np.diff(time)
+    return np.append(0, np.cumsum(np.maximum(np.rint(steps / np.median(steps)), 1)))
+
+
 def told(recordings, model: mujoco.MjModel) -> list[str]:
     """What is worth knowing of the recordings' quality, one line for each kind of thing."""
     found = {}
@@ -102,7 +117,7 @@ def _lines(recording, quality, model):
         )
     if quality.jitter > UNEVEN * quality.period:
         what = (
-            "the rows were taken evenly: an even grid fits the motion better than the stamps do"
+            "the rows were taken evenly: an even grid fits the motion better, and takes their place"
             if quality.even
             else "the motion follows them"
         )
@@ -210,9 +225,7 @@ def stamps(time: np.ndarray) -> tuple[float, float, float]:
 def taken_evenly(time: np.ndarray, positions: list[np.ndarray]) -> bool:
     """Whether the motion is smoother with rows an even time apart than at their stamps: of all
     joints together, for where one is slow its noise is the same with either."""
-    steps = np.diff(time)
-    rows = np.append(0, np.cumsum(np.maximum(np.rint(steps / np.median(steps)), 1)))
-    ratios = []
+    rows, ratios = _rows(time), []
     for q in positions:
         known = np.isfinite(q)
         if known.sum() > 20 and np.ptp(q[known]) > 0:

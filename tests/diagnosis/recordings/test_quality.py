@@ -3,15 +3,18 @@ none."""
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from arm import arm, run
+from plants import DRIVEN_PENDULUM, recorded
 from scipy.signal import lfilter
 
 from diagnosis.recordings.quality import (
     assess,
     differenced_velocity,
     encoder_quantum,
+    evenly_stamped,
     interpolated_from,
     stamps,
     taken_evenly,
@@ -103,6 +106,24 @@ def test_late_stamps_and_late_rows_are_told_apart():
     jittered = T + np.random.default_rng(0).uniform(-1, 1, len(T)) * 0.2 * DT
     assert taken_evenly(jittered, [motion(T) + noise(1e-5)])
     assert not taken_evenly(jittered, [motion(jittered) + noise(1e-5)])
+
+
+def test_of_many_joints_the_fast_one_tells_that_rows_were_taken_evenly():
+    jittered = T + np.random.default_rng(0).uniform(-1, 1, len(T)) * 0.2 * DT
+    slow = [1e-3 * motion(T) + noise(1e-5, seed=k) for k in range(5)]
+    assert not taken_evenly(jittered, slow)
+    assert taken_evenly(jittered, [*slow, motion(T) + noise(1e-5)])
+
+
+def test_an_even_grid_stands_in_the_place_of_stamps_that_jitter():
+    model = mujoco.MjModel.from_xml_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5))
+    run = recorded("run.csv", 0)
+    wrong = run.time + np.random.default_rng(0).uniform(-1, 1, len(run.time)) * 0.2 * 0.01
+    wrong[[0, -1]] = run.time[[0, -1]]
+    late = replace(run, time=wrong)
+    late, true = (evenly_stamped(replace(r, quality=assess(r, model))) for r in (late, run))
+    np.testing.assert_allclose(late.time, run.time, atol=1e-9)
+    assert true.time is run.time
 
 
 def test_rows_interpolated_from_a_slower_rate():
