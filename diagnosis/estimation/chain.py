@@ -45,7 +45,7 @@ class Chain(Ahead):
         self.beside = np.where(self.known, beside, 0.0)
         # columns are differences: what a coarse step does wrong it does with an effect and without
         step = {c: v for c, v in self.base.items() if c.effect.name == "time_step"}
-        self.coarse, self.base = coarse(self.world, trajectory.first, step), self.plain(self.base)
+        self.coarse, self.base = coarse(self.world, trajectory.first), self.plain(self.base)
         rough = self._rows({**self.coarse, **self.base}, self.begin)
         self.finer, self.beyond = self._rows({**step, **self.base}, self.begin) - rough, {}
         self.contacts = self._begun([self.windows[i] for i in self.touched])

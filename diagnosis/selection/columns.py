@@ -57,6 +57,11 @@ def stepwise(world, candidate):
     return effect.stepwise(world.model, effect.id(world.model, candidate.place.name))
 
 
+def rough(setting):
+    """A setting without a finer time step."""
+    return {c: v for c, v in setting.items() if c.effect.name != "time_step"}
+
+
 class Columns:
     """Simulates the columns of starts about a setting. residual (W, T, nv); array (W, T, nv, K);
     options."""
@@ -68,6 +73,9 @@ class Columns:
         self.options, self.simulated = [], int(residual is None)
         self.seen = {} if seen is None else seen
         self.residual = ahead.residual([setting])[0] if residual is None else residual
+        self.rough = self.residual  # with the simulator's own step, as columns are differences
+        if rough(setting).keys() != setting.keys():
+            self.rough = ahead.residual([rough(setting)])[0]
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts, self.begun = [], []  # the Start of every option
         self._simulate(starts)
@@ -91,12 +99,16 @@ class Columns:
     def _simulate(self, starts):
         """Simulate starts; those that change nothing are left out."""
         starts = sorted(starts, key=lambda start: stepwise(self.world, start.candidate))
-        settings = [setting for start in starts for setting in start.settings(self.setting)]
-        changes = []
+        settings, bases, changes = [], [], []
+        for start in starts:
+            finer, some = start.candidate.effect.name == "time_step", start.settings(self.setting)
+            settings += some if finer else map(rough, some)
+            bases += [self.residual if finer else self.rough] * len(some)
         for k in range(0, len(settings), TOGETHER):
-            for gap in self.ahead.residual(settings[k : k + TOGETHER]):
+            gaps = self.ahead.residual(settings[k : k + TOGETHER])
+            for base, gap in zip(bases[k:], gaps):
                 with np.errstate(over="ignore"):
-                    change = (self.residual - gap).astype(np.float32)
+                    change = (base - gap).astype(np.float32)
                 gone = self.lost | (abs(gap) >= self.ahead.travel) | ~np.isfinite(change)
                 changes.append(np.where(gone, np.float32(0.0), change))
         self.simulated += len(settings)

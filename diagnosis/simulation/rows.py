@@ -21,10 +21,9 @@ SWING = 0.3  # rad of phase, or share of the decay, of the fastest joint's motio
 SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per second, of the force
 
 
-def coarse(world, recordings, step):
-    """{time_step: seconds}: a few steps in a row, for what is a difference of two simulations; at
-    most COARSER times the simulator's own, or that of a step {time_step: (seconds,)}."""
-    own = next(iter(step.values()), (world.model.opt.timestep,))[0]
+def coarse(world, recordings):
+    """{time_step: seconds}: a few steps in a row, for what is a difference of two simulations."""
+    own = world.model.opt.timestep
     seconds = np.median(np.concatenate([np.diff(r.time) for r in recordings])) / STEPS
     seconds = min(seconds, COARSER * own, SWING / max(_fastest(world.model), 1e-9))
     # never quite the simulator's own, with which Euler's method would be explicit in drives

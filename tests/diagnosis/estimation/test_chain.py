@@ -124,11 +124,9 @@ def test_coarse_steps_are_no_longer_than_the_stiffest_servo_allows(kp):
     world = World(spec)
     own = world.model.opt.timestep
     runs, inertia = [recorded("run.csv", 1, seconds=2.0)], 1 / world.model.dof_invweight0[0]
-    [(finer, (step,))] = rows.coarse(world, runs, {}).items()
+    [(_, (step,))] = rows.coarse(world, runs).items()
     assert own < step + 1e-12 <= max(own, 0.3 / np.sqrt(max(kp, 1e-9) / inertia)) + 2e-12
     assert (step > own) == (kp < 1000)
-    [(_, (beside,))] = rows.coarse(world, runs, {finer: (own / 8,)}).items()
-    assert beside <= own / 2  # of a finer step of the setting's, four at most
 
 
 def test_the_same_damping_in_a_drive_and_in_a_joint_does_the_same_in_a_row():
@@ -137,7 +135,7 @@ def test_the_same_damping_in_a_drive_and_in_a_joint_does_the_same_in_a_row():
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     world = World(spec)
     runs = [recorded("run.csv", 1, seconds=2.0)]
-    step = rows.coarse(world, runs, {})
+    step = rows.coarse(world, runs)
     ahead = []
     for effect, place in (("viscous_damping", "pivot"), ("back_emf", "drive")):
         row = rows.RowMap(world, runs, {**step, world.candidate(effect, place): (2.0,)})
