@@ -25,6 +25,7 @@ from diagnosis.simulation.rows import RowMap
 BLOCK = 200  # rows that are smoothed as one piece
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
 MOST = 10.0  # factor of a variance in one update
+LOUDER = 2.0  # times what differences of readings show, the most that noise may be: motion is more
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
 
 
@@ -269,7 +270,8 @@ class Smoother:
         ratio = lambda pair: np.clip(pair[0] / np.maximum(pair[1], 1e-300), 1 / MOST, MOST)
         self.walk = np.maximum(self.walk * ratio(found.process)[2 * nv :], 1e-12 * self.scale**2)
         known = found.measurement[1] > 0
-        self.R = np.where(known, np.maximum(self.R * ratio(found.measurement), self.floor), self.R)
+        moved = np.clip(self.R * ratio(found.measurement), self.floor, LOUDER**2 * self.floor)
+        self.R = np.where(known, moved, self.R)
 
 
 def _measured_velocity(model, recording):

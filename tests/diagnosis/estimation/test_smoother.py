@@ -1,6 +1,7 @@
 """The located force against hidden ones that were put into stock MuJoCo, and against none."""
 
 from copy import copy
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -191,3 +192,15 @@ def test_a_sensor_that_is_off_is_no_missing_force(name, value, off):
     assert np.sqrt(np.mean(again.force[5:-5] ** 2)) < 0.15 * forces[1]
     # what is told are states as the sensor shows them
     assert np.sqrt(np.mean((under.qpos[5:-5, 0] - seen[5:-5]) ** 2)) < 0.5 * NOISE
+
+
+def test_noise_is_between_what_differences_show_and_twice_that():
+    """Where impacts throw a motion off, what is left of it is no noise."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    smoother = Smoother(world, [recorded("0.csv", 0)])
+    shown = smoother.floor.copy()
+    for more, times in ((100.0, 2.0), (0.01, 1.0)):
+        found = SimpleNamespace(process=np.ones((2, 3)), measurement=(np.full(2, more), np.ones(2)))
+        for _ in range(5):
+            smoother._update(found)
+        np.testing.assert_allclose(smoother.R[:1], times**2 * shown[:1])
