@@ -137,11 +137,11 @@ class ServoStiffness(ServoGain):
 
 @catalogue
 class ServoDamping(ServoGain):
-    """kv in force = kp (u − q) − kv q̇, in N·m·s/rad or N·s/m; kp stays. Source: MuJoCo's
-    <position>.
+    """kv in force = kp (u − q) − kv q̇, in N·m·s/rad or N·s/m; kp stays. Or in kv (u − q̇).
+    Source: MuJoCo's <position> and <velocity>.
 
     The same force as `back_emf`, and as `viscous_damping` of the one joint it drives (but for a
-    limited force): a class.
+    limited force): a class. Of a <velocity> servo, the same as `gain`.
     """
 
     name, related = "servo_damping", ("gain", "servo_stiffness", "viscous_damping", "back_emf")
@@ -151,11 +151,28 @@ class ServoDamping(ServoGain):
         (damping,) = BackEmf().parameters(model, i)
         return (replace(damping, name="kv"),)
 
+    def fits(self, model, i):
+        alone = self._follows_speed(model.actuator_gainprm[i], model.actuator_biasprm[i])
+        plain = model.actuator_gaintype[i] == int(mujoco.mjtGain.mjGAIN_FIXED)
+        return super().fits(model, i) or bool(
+            ActuatorEffect.fits(self, model, i) and plain and alone
+        )
+
+    @staticmethod
+    def _follows_speed(gainprm, biasprm):
+        return biasprm[1] == 0 and 0 < gainprm[0] == -biasprm[2]
+
+    def _set(self, gainprm, biasprm, kv):
+        if self._follows_speed(gainprm, biasprm):
+            gainprm[0] = kv
+        biasprm[2] = -kv
+
     def edit(self, model, i, values):
-        model.actuator_biasprm[i, 2] = -values[0]
+        self._set(model.actuator_gainprm[i], model.actuator_biasprm[i], values[0])
 
     def write(self, spec, model, i, values):
-        self.general(spec, model, i).biasprm[2] = -values[0]
+        actuator = self.general(spec, model, i)
+        self._set(actuator.gainprm, actuator.biasprm, values[0])
         return "mjcf"
 
 

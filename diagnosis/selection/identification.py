@@ -27,6 +27,7 @@ ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
 CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
+ALONE = 4  # single effects that it judges beside them
 TRIED = 2  # effects of a set that may be missed least, tried without
 
 
@@ -146,7 +147,8 @@ class Identification:
     def _finalists(beam, start, nodes, number):
         """Nodes for the simulator, best first: of other effects, not a better one and more, and not
         one that predicts the same: classes are told later. A column begun far from the truth may
-        not be worth its price yet, but no chance."""
+        not be worth its price yet, but no chance. Then the best single effects: where something
+        touches, columns tell little of whole values."""
         chosen, seen = [], []
         for node in nodes:
             if len(chosen) == FINALISTS:
@@ -161,7 +163,11 @@ class Identification:
             if not any(same) and not any(names >= better for better in seen):
                 seen.append(names)
                 chosen.append(node)
-        return chosen
+        alone = {}
+        for node in nodes:
+            if len(node.options) == len(start.options) + 1:
+                alone.setdefault(beam.columns.options[node.options[-1]].candidate, node)
+        return chosen + [n for n in list(alone.values())[:ALONE] if n not in chosen]
 
     def _choose(self, judged, now, number):
         """The simplest set that is earned over what there was, and the best is not over it."""

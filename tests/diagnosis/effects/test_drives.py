@@ -159,11 +159,25 @@ def test_stiffness_and_damping_of_a_servo():
     np.testing.assert_allclose(run(world, {gain: (1.2,)}, recording), both, rtol=0, atol=1e-12)
 
 
-def test_only_a_position_servo_has_gains_of_its_own():
-    kinds = {"motors": 0, "servos": 2}
-    for kind, count in kinds.items():
+def test_only_servos_have_gains_of_their_own():
+    kinds = {"motors": (0, 0), "servos": (2, 3)}  # one of which follows a speed
+    for kind, counts in kinds.items():
         names = [c.effect.name for c in arm(kind)[0].candidates]
-        assert names.count("servo_stiffness") == names.count("servo_damping") == count
+        assert (names.count("servo_stiffness"), names.count("servo_damping")) == counts
+
+
+def test_the_only_gain_of_a_servo_that_follows_a_speed_is_its_gain():
+    xml = SERVO.replace(
+        'position name="m" joint="j" kp="3" kv="0.05"', 'velocity name="m" joint="j" kv="0.4"'
+    )
+    world, recording = World(mujoco.MjSpec.from_string(xml)), waves()
+    gain, slow = (world.candidate(n, "m") for n in ("gain", "servo_damping"))
+    assert slow.nominal == (0.4,)
+    qpos = run(world, {slow: (0.6,)}, recording)
+    np.testing.assert_allclose(run(world, {gain: (1.5,)}, recording), qpos, rtol=0, atol=1e-12)
+    assert abs(run(world, {}, recording) - qpos).max() > 0.01
+    written = mujoco.MjModel.from_xml_string(world.corrected_xml({slow: (0.6,)})[0])
+    assert (written.actuator_gainprm[0, 0], written.actuator_biasprm[0, 2]) == (0.6, -0.6)
 
 
 def test_bristles_bend_before_they_slip():
