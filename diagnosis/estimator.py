@@ -126,8 +126,8 @@ def _beside(search, judge, fitted, rest, price):
 
 def _classes(search, found, fitted, log, candidates):
     """(Fitted, {candidate: [(other, values)]}): the classes of its findings among candidates."""
-    some = candidates, found.judge, found.chain, fitted
-    return rivals.classes(*some, search.begun, log)
+    begun = lambda setting: search.begun(found.judge, setting)
+    return rivals.classes(candidates, found.judge, found.chain, fitted, begun, log)
 
 
 def _at(world, candidate, joint):

@@ -102,9 +102,13 @@ class ServoGain(ActuatorEffect):
     acts_through = "control"
 
     def fits(self, model, i):
-        kp = -model.actuator_biasprm[i, 1]
         plain = model.actuator_gaintype[i] == int(mujoco.mjtGain.mjGAIN_FIXED)
-        return bool(super().fits(model, i) and plain and kp > 0 and model.actuator_gainprm[i, 0])
+        follows = self._follows(model.actuator_gainprm[i], model.actuator_biasprm[i])
+        return bool(super().fits(model, i) and plain and follows)
+
+    def _follows(self, gainprm, biasprm):
+        """Whether an actuator of these parameters is such a servo."""
+        return biasprm[1] < 0 and gainprm[0] != 0
 
 
 @catalogue
@@ -151,12 +155,8 @@ class ServoDamping(ServoGain):
         (damping,) = BackEmf().parameters(model, i)
         return (replace(damping, name="kv"),)
 
-    def fits(self, model, i):
-        alone = self._follows_speed(model.actuator_gainprm[i], model.actuator_biasprm[i])
-        plain = model.actuator_gaintype[i] == int(mujoco.mjtGain.mjGAIN_FIXED)
-        return super().fits(model, i) or bool(
-            ActuatorEffect.fits(self, model, i) and plain and alone
-        )
+    def _follows(self, gainprm, biasprm):
+        return super()._follows(gainprm, biasprm) or self._follows_speed(gainprm, biasprm)
 
     @staticmethod
     def _follows_speed(gainprm, biasprm):

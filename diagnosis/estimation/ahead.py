@@ -28,6 +28,11 @@ def cut_ahead(recordings, longest=HORIZONS[-1]):
     return [windows[i] for i in windowing.evenly(len(windows), MOST)]
 
 
+def with_own_step(setting):
+    """A setting with the simulator's own time step in the place of a finer one."""
+    return {c: v for c, v in setting.items() if c.effect.name != "time_step"}
+
+
 class Ahead:
     """Windows of recordings with start states, and what is measured in them.
 
@@ -131,7 +136,7 @@ class Ahead:
         step = (steps[0] if steps else self.model.opt.timestep) / refine
         if step == self.step or runge_kutta(self.model):
             return self.qvel
-        rest = {c: v for c, v in setting.items() if c.effect.name != "time_step"}
+        rest = with_own_step(setting)
         short = [w._replace(last=w.first + 1) for w in self.windows]
         qvel = self.world.simulate([rest] * len(short), self.qpos, self.qvel, short)[1]
         gained = (qvel[:, 1] - qvel[:, 0]) / self.seconds[:, 1:2]

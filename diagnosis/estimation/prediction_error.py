@@ -96,9 +96,8 @@ def floor_gaps(world, settings, smoother, trajectory, horizon=windowing.HORIZON)
 def _velocity_spread(smoother, trajectory):
     """Standard deviation (nv,) of velocities as recorded. Filtered differences of positions have no
     noise of their own: theirs is how far they are from the smoothed motion."""
-    noise, gaps = smoother.velocity_noise, []
-    for r in smoother.recordings:
-        gaps.append(r.qvel - trajectory.qvel[trajectory.rows(r)])
+    noise = smoother.velocity_noise
+    gaps = [r.qvel - trajectory.qvel[trajectory.rows(r)] for r in smoother.recordings]
     square = np.concatenate(gaps) ** 2
     known = np.isfinite(square)
     apart = np.sqrt(np.where(known, square, 0.0).sum(0) / np.maximum(known.sum(0), 1))

@@ -25,7 +25,7 @@ from diagnosis.simulation.rows import RowMap
 BLOCK = 200  # rows that are smoothed as one piece
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
 MOST = 10.0  # factor of a variance in one update
-LOUDER = 20.0  # times what differences of readings show, the most that noise may be: motion is more
+LOUDER = 20.0  # noise is at most so many times what differences of readings show
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
 
 

@@ -58,6 +58,11 @@ class Quality:
     skipped: float = 0.0
     rows_from: float | None = None
 
+    @property
+    def jitters(self):
+        """Whether the stamps are away from an even grid."""
+        return self.jitter > UNEVEN * self.period
+
 
 def assess(recording, model: mujoco.MjModel) -> Quality:
     """The Quality of one recording."""
@@ -79,10 +84,9 @@ def assess(recording, model: mujoco.MjModel) -> Quality:
 
 def evenly_stamped(recording):
     """A recording of known Quality, at stamps of an even grid where its rows were taken evenly."""
-    quality, time = recording.quality, recording.time
-    if not quality.even or quality.jitter <= UNEVEN * quality.period:
+    if not (recording.quality.jitters and recording.quality.even):
         return recording
-    rows = _rows(time)
+    time, rows = recording.time, _rows(recording.time)
     return replace(recording, time=time[0] + rows * (time[-1] - time[0]) / rows[-1])
 
 
@@ -115,7 +119,7 @@ def _lines(recording, quality, model):
             f"qvel:{name} is no measurement of its own but a filtered difference of qpos:{name}, "
             f"{1e3 * how.delay:.1f} ms late; it adds nothing to the positions"
         )
-    if quality.jitter > UNEVEN * quality.period:
+    if quality.jitters:
         what = (
             "the rows were taken evenly: an even grid fits the motion better, and takes their place"
             if quality.even

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from diagnosis.estimation.ahead import with_own_step
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.starts import Start
 
@@ -57,11 +58,6 @@ def stepwise(world, candidate):
     return effect.stepwise(world.model, effect.id(world.model, candidate.place.name))
 
 
-def rough(setting):
-    """A setting without a finer time step."""
-    return {c: v for c, v in setting.items() if c.effect.name != "time_step"}
-
-
 class Columns:
     """Simulates the columns of starts about a setting. residual (W, T, nv); array (W, T, nv, K);
     options."""
@@ -74,8 +70,8 @@ class Columns:
         self.seen = {} if seen is None else seen
         self.residual = ahead.residual([setting])[0] if residual is None else residual
         self.rough = self.residual  # with the simulator's own step, as columns are differences
-        if rough(setting).keys() != setting.keys():
-            self.rough = ahead.residual([rough(setting)])[0]
+        if with_own_step(setting) != setting:
+            self.rough = ahead.residual([with_own_step(setting)])[0]
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts, self.begun = [], []  # the Start of every option
         self._simulate(starts)
@@ -102,7 +98,7 @@ class Columns:
         settings, bases, changes = [], [], []
         for start in starts:
             finer, some = start.candidate.effect.name == "time_step", start.settings(self.setting)
-            settings += some if finer else map(rough, some)
+            settings += some if finer else map(with_own_step, some)
             bases += [self.residual if finer else self.rough] * len(some)
         for k in range(0, len(settings), TOGETHER):
             gaps = self.ahead.residual(settings[k : k + TOGETHER])

@@ -89,14 +89,13 @@ class Identification:
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
         that misses."""
-        self.reference = squares(self.ahead)
-        return Judge(self.ahead, self.usual, self.reference, self.seen)
+        return Judge(self.ahead, self.usual, squares(self.ahead), self.seen)
 
-    def begun(self, setting):
-        """A Judge whose windows begin at the motion that is located under a setting."""
+    def begun(self, judge, setting):
+        """A Judge like another one, of windows that begin at the motion located under a setting."""
         ahead = copy(self.ahead)
         ahead.start(copy(self.smoother).locate(setting, self.trajectory, passes=2), setting)
-        return Judge(ahead, self.usual, self.reference, self.seen)
+        return Judge(ahead, self.usual, judge.reference, self.seen)
 
     def _round(self, setting, judge):
         """(Fitted, whether it holds other effects than there were, first ranking)."""

@@ -21,9 +21,8 @@ BLOCKS = 16  # stretches of time that are left out in turn
 LEAST = 0.03
 # periods over the travel, or a recording, from, to and by, of forces that come and go
 WAVES = 1.0, 30.0, 0.1
-SLOWEST = (
-    2.0  # radians of such a wave for each that a joint turns: with one, gravity comes and goes
-)
+# radians of such a wave for each of the variable's own unit, at least: gravity has one a radian
+SLOWEST = 2.0
 SAMPLED = 2000  # rows in which these are looked for
 CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 

@@ -79,6 +79,17 @@ def test_a_refit_with_more_steps_has_to_predict_better_what_is_left_out(
     assert search.further(judge, first) is (more if kept else first)
 
 
+@pytest.mark.parametrize("loss, kept", [(-1.1, True), (-0.5, False)])
+def test_a_finer_time_step_stands_beside_what_was_chosen_where_that_is_better(search, loss, kept):
+    first = fitted(search, ["coulomb_friction"], -1.0)
+    step, asked = search.world.candidate("time_step", "world"), []
+    finer = SimpleNamespace(setting={**first.setting, step: (0.001,)}, loss=loss)
+    judge = SimpleNamespace(fit=lambda setting, steps: asked.append(setting) or finer)
+    assert search.finer(judge, first) is (finer if kept else first)
+    assert asked == [{**first.setting, step: (step.nominal[0] / 4,)}]
+    assert search.finer(judge, finer) is finer and len(asked) == 1
+
+
 def node(losses, price, *names):
     """A Node of a beam with these losses of groups; names: indices of its options."""
     groups = np.array(losses, float)
