@@ -28,7 +28,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     WHOLE: {},
     "no price of complexity": {"diagnosis.selection.criterion:PRICE": 0.0},
     "start states are certain": {"diagnosis.estimation.ahead:FREE": 0.0},
-    "a name stands whatever it leaves": {"diagnosis.unnamed:INSTEAD": 2.0},
+    "a name stands whatever it leaves": {"diagnosis.unnamed:NEAREST": 2.0},
     "no correction for the number looked at": {"diagnosis.selection.identification:LEVEL": 1.0},
     "a beam of one": {"diagnosis.selection.beam:WIDTH": 1},
     "no values at full size": {"diagnosis.selection.starts:LADDER": ()},

@@ -21,12 +21,11 @@ from diagnosis.selection.identification import (
     Found,
     Identification,
     changing,
-    no_chance,
     without,
 )
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
-from diagnosis.unnamed import INSTEAD, UNNAMED
+from diagnosis.unnamed import NEAREST, UNNAMED
 
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 
@@ -106,7 +105,7 @@ def _checked(search, found, fitted, others, log):
             continue
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
         size = _force(found, trajectory, world, rest.joint)
-        if not mine or rest.size > INSTEAD * size:
+        if not mine or rest.size > NEAREST * size:
             fitted = search.pruned(judge, beside) if mine else beside
         if rest.candidate in fitted.setting:
             break
@@ -119,7 +118,7 @@ def _beside(search, judge, fitted, rest, price):
     for steps in (0, 2):
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=steps)
         step = paired(fitted.score, beside.score)
-        if step.gain < price or not no_chance(step, len(search.candidates)):
+        if step.gain < price or not search.no_chance(step):
             return None
     return beside
 

@@ -3,7 +3,7 @@ depends on.
 
 findings = led(world, outcome, findings, something)
 
-A name stands first only where the error of its joint goes with it. Where most of that is left,
+A name stands first only where the error of its joint goes with it. Where much of that is left,
 `unknown` leads, and the name is one of those that it may be.
 """
 
@@ -13,9 +13,9 @@ from diagnosis.effects.base import HINGE, SLIDE
 from diagnosis.selection.criterion import BEYOND, PRICE
 from diagnosis.selection.plausibility import at_limit, plausible
 
-NEAREST, INSTEAD = 0.25, 0.5  # of a joint's error, that names leave: the nearest only, or none
+NEAREST = 0.25  # of a joint's error, that names leave: they are the nearest only
 UNNAMED = 2  # units of complexity of a force where nothing has a name
-MOST = 3  # names that an unknown force may have
+MOST = 3  # names that an unknown force may have, and variables that it depends on
 
 
 def left(fitted):
@@ -84,8 +84,8 @@ def unknown(joint, outcome):
 
 
 def beside(finding, name):
-    """A finding of an unknown force, with a name that it may have and that is written in its
-    place."""
+    """A finding of an unknown force, with a name that it may have, that is written in its place and
+    that says what most of it varies with."""
     other = {key: name[key] for key in ("effect", "place", "parameters")}
     evidence, more = finding["evidence"], name["evidence"]
     removed = evidence["held_out_error_removed"] + more["held_out_error_removed"]
@@ -94,6 +94,7 @@ def beside(finding, name):
     return {
         **finding,
         "evidence": {**evidence, "held_out_error_removed": removed, "p_value": p},
+        "depends_on": list(dict.fromkeys(name["depends_on"] + finding["depends_on"]))[:MOST],
         "written_as": name["written_as"] if written == "none" else written,
         "also_possible": [*finding["also_possible"], other][:MOST],
     }
@@ -106,7 +107,7 @@ def _at_edge(outcome, candidate):
 
 
 def led(world, outcome, findings, something):
-    """Findings with `unknown` in the place of names that leave most of the error of their joint or
+    """Findings with `unknown` in the place of names that leave much of the error of their joint or
     have a value at the edge of what was tried, or where something is missing and nothing has a
     name.
 
@@ -121,12 +122,11 @@ def led(world, outcome, findings, something):
             told = share if np.isfinite(share) else None
             finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
             edge = _at_edge(outcome, candidate)
-            if at and (share > INSTEAD or edge):
+            if at and (share > NEAREST or edge):
                 joint = at
                 leads[joint] = beside(leads.get(joint) or unknown(joint, outcome), finding)
-            elif share > NEAREST or edge:
-                on = next((d.variables for d in outcome.left if d.joint == at), ())
-                finding |= {"adequate": False, "rest_depends_on": list(on)}
+            elif edge:
+                finding |= {"adequate": False}
         if joint is None:
             order.append(finding)
         elif joint not in order:

@@ -31,8 +31,9 @@ from diagnosis.effects.joints import (
 MOST_FALL = 5.0  # times the friction of motion, that of rest at most: dry surfaces reach 2 to 3
 FALLS = 0.05
 SELF_LOCKING = 2.0  # share of the load beyond which no drive would turn
-CYCLES = 1.0, 2.0, 3.0  # of a friction map over the travel, to try first
-PHASES = 0.0, np.pi / 2, np.pi, 1.5 * np.pi
+# radians of a friction map's wave over the travel, to try first: of one of them the truth stays in
+# step with it from end to end
+TURNS = np.arange(3.25, 40.0, 3.0)
 
 
 @catalogue
@@ -206,6 +207,7 @@ class FrictionMap(DryFriction):
     """
 
     name, law, amplitudes, loaded = "friction_map", "friction_wave", 1, False
+    together = 3
 
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
@@ -227,9 +229,16 @@ class FrictionMap(DryFriction):
         return np.ptp(np.quantile(position, [0.02, 0.98])) + 1e-6 if len(position) else 1.0
 
     def probes(self, model, i, recordings):
+        """Of each wave number three that hold any level, contrast and phase together."""
         level, travel = 0.1 * self.scale(model, i), self._travelled(model, i, recordings)
-        waves = [2 * np.pi * cycles / travel for cycles in CYCLES]
-        return np.array([(level, 0.8, n, phase) for n in waves for phase in PHASES])
+        shapes = (0.0, 0.0), (1.0, 0.0), (1.0, np.pi / 2)
+        return np.array([(level, c, turn / travel, phase) for turn in TURNS for c, phase in shapes])
+
+    def merged(self, rows, amounts):
+        level = sum(amount * row[0] for row, amount in zip(rows, amounts))
+        wave = sum(a * r[0] * r[1] * np.exp(1j * r[3]) for r, a in zip(rows, amounts))
+        contrast = min(abs(wave) / max(level, 1e-300), 1.0)
+        return (rows[0][0], contrast, rows[0][2], float(np.angle(wave))), level / rows[0][0]
 
     def possible(self, values, nominal):
         return values[0] > 0 and values[1] > 0.05

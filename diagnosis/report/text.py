@@ -357,8 +357,6 @@ def doubts(finding: dict) -> list[str]:
 
 def nearest_only(finding: dict) -> str:
     """Why a finding is not adequate."""
-    if on := depends_words(finding.get("rest_depends_on")):
-        return f"the rest of its force depends on {on} still"
     seen = [p for p in finding["parameters"] if p.get("low") is not None]
     if not seen:
         return "none of its values shows"

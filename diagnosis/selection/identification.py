@@ -116,8 +116,7 @@ class Identification:
         )
         now = judge.fit(setting)
         judged = [now]
-        number = len(every) + len(curves)
-        for node in self._finalists(beam, start, nodes, number):
+        for node in self._finalists(beam, start, nodes):
             fitted = judge.fit(beam.setting(node), steps=3)
             p = paired(now.score, fitted.score).p_value
             losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
@@ -125,7 +124,7 @@ class Identification:
             judged.append(fitted)
             if not fitted.settled:  # what has no value may hide others that have
                 judged.append(judge.fit(fitted.inside, steps=3))
-        best = self._choose(judged, now, number)
+        best = self._choose(judged, now)
         if best is not now:
             best = self.pruned(judge, self.finer(judge, self.further(judge, best)))
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
@@ -142,8 +141,7 @@ class Identification:
         found = [d for d in found if d.variables != (f"velocity:{d.joint}",)]
         return [(d.candidate, d.values) for d in found if d.joint not in taken][:CURVES]
 
-    @staticmethod
-    def _finalists(beam, start, nodes, number):
+    def _finalists(self, beam, start, nodes):
         """Nodes for the simulator, best first: of other effects, not a better one and more, and not
         one that predicts the same: classes are told later. A column begun far from the truth may
         not be worth its price yet, but no chance. Then the best single effects: where something
@@ -152,7 +150,7 @@ class Identification:
         for node in nodes:
             if len(chosen) == FINALISTS:
                 break
-            if node.loss >= start.loss and not no_chance(paired(start.score, node.score), number):
+            if node.loss >= start.loss and not self.no_chance(paired(start.score, node.score)):
                 continue
             options = beam.columns.options
             added = [options[k].candidate for k in node.options[len(start.options) :]]
@@ -168,13 +166,13 @@ class Identification:
                 alone.setdefault(beam.columns.options[node.options[-1]].candidate, node)
         return chosen + [n for n in list(alone.values())[:ALONE] if n not in chosen]
 
-    def _choose(self, judged, now, number):
+    def _choose(self, judged, now):
         """The simplest set that is earned over what there was, and the best is not over it."""
         judged = [f for f in judged if f is now or f.settled]
         best = min(judged, key=lambda f: f.loss)
-        if best is now or not self.earned(now, best, number):
+        if best is now or not self.earned(now, best):
             return now
-        good = [f for f in judged if f is not now and self.earned(now, f, number)]
+        good = [f for f in judged if f is not now and self.earned(now, f)]
         good = [f for f in good if f is best or not self.earned(f, best)]
         return min(good, key=lambda f: (complexity(f.setting), f.loss))
 
@@ -194,9 +192,14 @@ class Identification:
         more = judge.fit({**fitted.setting, step: tuple(p.low for p in step.parameters)}, steps=3)
         return more if more.loss < fitted.loss else fitted
 
-    def earned(self, before, after, number=1):
-        """Whether a set is worth its complexity, and better by no chance among those looked at."""
-        return after.loss < before.loss and no_chance(paired(before.score, after.score), number)
+    def earned(self, before, after):
+        """Whether a set is worth its complexity, and better by no chance among those looked at: an
+        effect of it is one of many too."""
+        return after.loss < before.loss and self.no_chance(paired(before.score, after.score))
+
+    def no_chance(self, step):
+        """Whether a Comparison is significant among all candidates, with two tests each."""
+        return step.p_value < LEVEL / len(self.candidates) / 2
 
     def pruned(self, judge, fitted):
         """Without the effects that do not earn their place beside the others. Those that small
@@ -271,11 +274,6 @@ def squares(ahead, residual=None):
     nominal model."""
     residual = ahead.residual([{}])[0] if residual is None else residual
     return Evidence(ahead, residual, np.zeros((*residual.shape, 0))).reference
-
-
-def no_chance(step, number):
-    """Whether a Comparison is significant among a number that are looked at with two tests each."""
-    return step.p_value < LEVEL / number / 2
 
 
 def said(setting):

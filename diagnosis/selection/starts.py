@@ -99,9 +99,15 @@ class Starts:
         zero = list(whole[0])
         zero[0] = 0.0
         forces = []
+        moves = np.tanh(t.qvel[rows] / np.maximum(t.qvel_sd[rows], 1e-9))
         for values in [zero, *whole]:
             model = engine.edited([(candidate, tuple(values))], world.model.opt.timestep)
-            forces.append(applied(model, t.qpos[rows], t.qvel[rows], engine))
+            force = applied(model, t.qpos[rows], t.qvel[rows], engine)
+            if candidate.effect.overrides("limit"):
+                i = candidate.effect.id(world.model, candidate.place.name)
+                limit = candidate.effect.limit([world.model], i, np.array([values], float))
+                force = force - moves * limit(t.qpos[rows], t.qvel[rows], None, None, None)
+            forces.append(force)
         none, *forces = forces
         target, together, left = t.force[rows].ravel(), candidate.effect.together, []
         for k in range(0, len(whole), together):

@@ -29,8 +29,8 @@ CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 
 @dataclass(frozen=True)
 class Dependence:
-    """share: of the located force's variance at the joint that the curve predicts; size: RMS of the
-    curve's force; candidate, values: the curve and the forces at its knots."""
+    """share: of the located force's variance at the joint that the curve predicts in stretches left
+    out; size: RMS of what it predicts; candidate, values: the curve and the forces at its knots."""
 
     joint: str
     variables: tuple
@@ -42,7 +42,7 @@ class Dependence:
 
 @dataclass(frozen=True)
 class Curve:
-    """share: of the force's variance, predicted on blocks left out; rms: of the curve's force."""
+    """share: of the force's variance, predicted on blocks left out; rms: of what is predicted."""
 
     share: float
     rms: float
@@ -142,8 +142,8 @@ def _explained(force, x, times, block, variable, wave=False):
         values = np.linalg.solve(gram.sum(0) - gram[b] + ridge, score.sum(0) - score[b])
         left += np.sum((force[block == b] - basis[block == b] @ values) ** 2)
     values = np.linalg.solve(gram.sum(0) + ridge, score.sum(0))
-    total = np.sum(force**2) + 1e-300
-    return Curve(1 - left / total, float(np.sqrt(np.mean((basis @ values) ** 2))), knots, values)
+    share = 1 - left / (np.sum(force**2) + 1e-300)
+    return Curve(share, float(np.sqrt(max(share, 0.0) * np.mean(force**2))), knots, values)
 
 
 def _quarter(force, x, times):

@@ -76,7 +76,7 @@ DEPENDS = [("elbow", ("position:elbow", "velocity:elbow")), ("shoulder", ("time"
     [
         (0.1, "coulomb_friction", True),  # no more than the noise
         (0.2, "coulomb_friction", True),
-        (0.4, "coulomb_friction", False),  # the nearest name
+        (0.4, "unknown", False),  # the nearest name
         (0.7, "unknown", False),
     ],
 )
@@ -90,8 +90,13 @@ def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequat
         assert only["depends_on"] == ["position:elbow", "velocity:elbow"]
         assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
         assert only["evidence"]["held_out_error_removed"] == 0.4
-    elif not adequate:
-        assert only["rest_depends_on"] == ["position:elbow", "velocity:elbow"]
+
+
+def test_an_unknown_force_varies_with_what_its_nearest_name_does():
+    nearest = finding(FRICTION)
+    nearest[1]["depends_on"] = ["velocity:elbow"]
+    told = unnamed.led(WORLD, outcome(smoothed(1.0), (1.0, 0.7), DEPENDS), [nearest], True)
+    assert told[0]["depends_on"] == ["velocity:elbow", "position:elbow"]
 
 
 def test_names_that_share_a_joint_are_one_unknown_force():

@@ -437,6 +437,17 @@ def test_two_phases_of_a_ripple_make_one(sine, cosine, poles):
     np.testing.assert_allclose(amount * amplitude * np.sin(same * q + phase), both, atol=1e-12)
 
 
+@given(st.floats(0.1, 3.0), st.floats(0.0, 1.0), st.floats(0.0, 6.2))
+def test_levels_of_a_friction_map_merge_into_one_wave(level, contrast, phase):
+    effect = next(e for e in EFFECTS if e.name == "friction_map")
+    rows = np.array([(0.2, 0.0, 5.0, 0.0), (0.2, 1.0, 5.0, 0.0), (0.2, 1.0, 5.0, np.pi / 2)])
+    sine, cosine = (level * contrast * f(phase) for f in (np.cos, np.sin))
+    amounts = np.array([level - sine - cosine, sine, cosine]) / 0.2
+    (base, told, waves, turned), amount = effect.merged(rows, amounts)
+    assert np.allclose((base * amount, told, waves), (level, contrast, 5.0), atol=1e-9)
+    assert contrast < 1e-6 or abs(np.exp(1j * turned) - np.exp(1j * phase)) < 1e-6
+
+
 def test_a_joint_at_its_stop_shows_its_sensors_fault():
     world = World(mujoco.MjSpec.from_string(ROD))
     fall = np.r_[np.linspace(0, 1.3, 60), 1.35, 1.3, np.full(40, 1.3)]

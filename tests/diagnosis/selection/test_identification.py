@@ -62,9 +62,24 @@ def test_a_set_is_chosen_for_its_worth(search):
     better = fitted(search, ["coulomb_friction", "viscous_damping"], -1.5)
     bound = fitted(search, ["armature"], -3.0, settled=False)
     little = fitted(search, ["coulomb_friction"], -0.05)
-    assert search._choose([now, friction, both, bound], now, 10) is friction
-    assert search._choose([now, friction, better], now, 10) is better
-    assert search._choose([now, little], now, 10) is now  # not worth its price
+    assert search._choose([now, friction, both, bound], now) is friction
+    assert search._choose([now, friction, better], now) is better
+    assert search._choose([now, little], now) is now  # not worth its price
+
+
+@pytest.mark.parametrize("share, kept", [(1.3, True), (0.8, False)])
+def test_an_effect_of_a_set_is_one_of_many_that_were_looked_at(search, share, kept, monkeypatch):
+    """In 16 groups that scatter by 1, gains of 1.3 and 0.8 have p-values of 1e-4 and 4e-3: the
+    second would be no chance if it were looked at alone."""
+    both = fitted(search, ["coulomb_friction", "viscous_damping"], -1.0)
+    less = fitted(search, ["coulomb_friction"], -1.0)
+    groups = both.score.groups + 0.5 * (share + np.where(np.arange(16) % 2, 1.0, -1.0))
+    both.score = Score(both.score.loss, both.score.groups, np.zeros(16), ())
+    less.score = Score(groups.mean(), groups, np.zeros(16), ())
+    less.loss = less.score.loss + PRICE * identification.complexity(less.setting)
+    monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[:1])
+    judge = SimpleNamespace(fit=lambda setting, steps: less)
+    assert search.pruned(judge, both) is (both if kept else less)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +124,7 @@ def test_finalists_are_worth_their_price_or_no_chance_and_predict_differently(se
     luck = node(noise + np.where(np.arange(16) == 3, -3.0, 0.0), 0.6, 3)
     more = node(noise - 0.7, 0.3, 0, 4)
     nodes = sorted([worth, dear, same, luck, more], key=lambda n: n.loss)
-    finalists = Identification._finalists(beam, start, nodes, 10)
+    finalists = search._finalists(beam, start, nodes)
     assert finalists[:3] == [more, worth, dear]
     assert finalists[3:] == [same, luck]  # simple sets are judged whatever columns tell of them
 
