@@ -106,12 +106,13 @@ class Effect:
     constants = False  # edit() changes something that mj_setConst derives constants from
     acts_through = ""  # what its force varies with: velocity, position, control or contact
     loaded = True  # limit() reads qfrc_bias
+    numerical = False  # the simulator's own method, no physics
     timed = False  # differs from a simpler effect only under a condition
     amplitudes = (
         0  # of an effect with probes: how many of its first parameters it acts in proportion to
     )
     together = 1  # of an effect with probes: how many in a row are tried as one
-    simplicity = 1  # 0 for the first things to think of, up to 3; -1 for what is no physics
+    simplicity = 1  # 0 for the first things to think of, up to 3; -1 for what is numerical
     related = ()  # names of effects at the same joint in whose wrong value this one may hide
 
     def __repr__(self):

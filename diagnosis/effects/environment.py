@@ -96,7 +96,7 @@ class TimeStep(Effect):
     those of joints: or the same damping would differ by where it is."""
 
     # no physics that a name could be spent on: it costs nothing, and all else is compared with it
-    name, kinds, simplicity = "time_step", ("world",), -1
+    name, kinds, numerical, simplicity = "time_step", ("world",), True, -1
 
     def parameters(self, model, i):
         h = model.opt.timestep

@@ -30,7 +30,7 @@ def cut_ahead(recordings, longest=HORIZONS[-1]):
 
 def with_own_step(setting):
     """A setting with the simulator's own time step in the place of a finer one."""
-    return {c: v for c, v in setting.items() if c.effect.name != "time_step"}
+    return {c: v for c, v in setting.items() if not c.effect.numerical}
 
 
 class Ahead:
@@ -132,7 +132,7 @@ class Ahead:
         Where positions move by a step's new velocity, a velocity is that of half a step before its
         time: with a shorter step it is a later one than that which was located.
         """
-        steps = [v[0] for c, v in setting.items() if c.effect.name == "time_step"]
+        steps = [v[0] for c, v in setting.items() if c.effect.numerical]
         step = (steps[0] if steps else self.model.opt.timestep) / refine
         if step == self.step or runge_kutta(self.model):
             return self.qvel

@@ -44,7 +44,7 @@ class Chain(Ahead):
         beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
         self.beside = np.where(self.known, beside, 0.0)
         # columns are differences: what a coarse step does wrong it does with an effect and without
-        step = {c: v for c, v in self.base.items() if c.effect.name == "time_step"}
+        step = {c: v for c, v in self.base.items() if c.effect.numerical}
         self.coarse, self.base = coarse(self.world, trajectory.first), self.plain(self.base)
         rough = self._rows({**self.coarse, **self.base}, self.begin)
         self.finer, self.beyond = self._rows({**step, **self.base}, self.begin) - rough, {}
@@ -123,7 +123,7 @@ class Chain(Ahead):
     def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""
         effect = candidate.effect
-        if candidate.when or effect.overrides("measure") or effect.name == "time_step":
+        if candidate.when or effect.overrides("measure") or effect.numerical:
             return True
         return self.world.adds_states(candidate)
 

@@ -97,7 +97,7 @@ class Columns:
         starts = sorted(starts, key=lambda start: stepwise(self.world, start.candidate))
         settings, bases, changes = [], [], []
         for start in starts:
-            finer, some = start.candidate.effect.name == "time_step", start.settings(self.setting)
+            finer, some = start.candidate.effect.numerical, start.settings(self.setting)
             settings += some if finer else map(with_own_step, some)
             bases += [self.residual if finer else self.rough] * len(some)
         for k in range(0, len(settings), TOGETHER):

@@ -29,7 +29,7 @@ def classes(candidates, judge, chain, fitted, begun, log=lambda what: None):
     so nothing is asked for in its place."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
-        if candidate not in fitted.setting or candidate.effect.name == "time_step":
+        if candidate not in fitted.setting or candidate.effect.numerical:
             continue
         members = _members(candidates, judge, chain, fitted, candidate)
         units, most = complexity(fitted.setting), fitted.loss - TIED

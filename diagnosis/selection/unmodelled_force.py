@@ -15,7 +15,7 @@ from diagnosis.effects.drives import drives_of
 from diagnosis.effects.unmodelled import asked
 from diagnosis.estimation import windowing
 
-KNOTS = 9
+FINE, KNOTS = 33, 9  # places over the range where a curve may bend, and values that it has at most
 BLOCKS = 16  # stretches of time that are left out in turn
 # share of the located force's variance, predicted on stretches left out, that a curve must explain
 LEAST = 0.03
@@ -111,39 +111,80 @@ def _factors(model, trajectory, ctrl, j, variable):
     return out
 
 
-def knots_of(x, variable):
-    """Knots (KNOTS,) over what was recorded; of velocities closer about zero."""
+def places_of(x, variable):
+    """Where a curve may bend (up to FINE,), over what was recorded; of velocities closer about
+    zero."""
     low, high = np.quantile(x, [0.005, 0.995])
     if not high > low:
         high = low + 1e-9
+    even = np.linspace(-1, 1, FINE)
     if variable.startswith("velocity") and low < 0 < high:
-        end = max(-low, high)
-        shape = np.array([-1, -0.5, -0.2, -0.03, 0.0, 0.03, 0.2, 0.5, 1.0])
-        return np.unique(np.clip(end * shape, low, high))
-    return np.linspace(low, high, KNOTS)
+        return np.unique(np.clip(max(-low, high) * even**3, low, high))
+    return low + (high - low) * (even + 1) / 2
 
 
 def _explained(force, x, times, block, variable, wave=False):
     """The Curve of a force over x, times a factor: linear between knots, or a wave."""
-    knots = _quarter(force, x, times) if wave else knots_of(x, variable)
-    if len(knots) < 2 + (not wave):
-        return Curve(0.0, 0.0, knots, np.zeros(len(knots)))
     if wave:
+        knots = _quarter(force, x, times)
         turn = np.pi / 2 * (x - knots[0]) / (knots[1] - knots[0])
-        basis = np.stack([np.cos(turn), np.sin(turn)], 1) * times[:, None]
-    else:
-        basis = np.stack([np.interp(x, knots, e) for e in np.eye(len(knots))], 1) * times[:, None]
-    number = block.max() + 1
-    gram = np.array([basis[block == b].T @ basis[block == b] for b in range(number)])
-    score = np.array([basis[block == b].T @ force[block == b] for b in range(number)])
-    ridge = 1e-4 * np.trace(gram.sum(0)) / len(knots) * np.eye(len(knots))
-    left = 0.0
-    for b in range(number):
-        values = np.linalg.solve(gram.sum(0) - gram[b] + ridge, score.sum(0) - score[b])
-        left += np.sum((force[block == b] - basis[block == b] @ values) ** 2)
-    values = np.linalg.solve(gram.sum(0) + ridge, score.sum(0))
-    share = 1 - left / (np.sum(force**2) + 1e-300)
-    return Curve(share, float(np.sqrt(max(share, 0.0) * np.mean(force**2))), knots, values)
+        sums = Sums(np.stack([np.cos(turn), np.sin(turn)], 1) * times[:, None], force, block)
+        return Curve(*sums.predicted([0, 1]), knots, sums.amounts([0, 1]))
+    places = places_of(x, variable)
+    low, span = places[0], places[-1] - places[0]
+    bends = lambda at: np.maximum((at[:, None] - places[:-1]) / span, 0.0)
+    shape = lambda at: np.column_stack([np.ones(len(at)), bends(np.clip(at, low, places[-1]))])
+    sums = Sums(shape(x) * times[:, None], force, block)
+    chosen = sums.chosen()
+    knots = places[[0, *sorted(k - 1 for k in chosen[2:]), -1]]
+    curve = shape(knots)[:, chosen] @ sums.amounts(chosen)
+    return Curve(*sums.predicted(chosen), knots, curve)
+
+
+class Sums:
+    """Of products of a basis (n, k) with itself and with a force (n,), in blocks (n,) of rows."""
+
+    def __init__(self, basis, force, block):
+        parts = [slice(*np.searchsorted(block, [b, b + 1])) for b in range(block.max() + 1)]
+        self.gram = np.array([basis[p].T @ basis[p] for p in parts])
+        self.score = np.array([basis[p].T @ force[p] for p in parts])
+        self.square, self.number = np.sum(force**2), len(force)
+
+    def _solved(self, gram, score):
+        ridge = 1e-5 * np.trace(gram, axis1=-2, axis2=-1)[..., None, None] / gram.shape[-1]
+        return np.linalg.solve(gram + (ridge + 1e-300) * np.eye(gram.shape[-1]), score[..., None])[
+            ..., 0
+        ]
+
+    def amounts(self, some):
+        """(p,) of columns some (p,) that fit the force."""
+        return self._solved(self.gram.sum(0)[np.ix_(some, some)], self.score.sum(0)[some])
+
+    def predicted(self, some):
+        """(share of the force's variance that columns some (p,) predict in each block from all the
+        others, RMS of that)."""
+        gram, score = self.gram[:, some][:, :, some], self.score[:, some]
+        z = self._solved(gram.sum(0) - gram, score.sum(0) - score)
+        left = self.square - 2 * np.sum(z * score) + np.einsum("bi,bij,bj->", z, gram, z)
+        share = float(1 - left / (self.square + 1e-300))
+        return share, float(np.sqrt(max(share, 0.0) * self.square / self.number))
+
+    def chosen(self):
+        """The columns [0, 1, ...], each next one that which explains most beside those before, as
+        many as predict best."""
+        gram, score = self.gram.sum(0), self.score.sum(0)
+        some = [0, 1]
+        best = self.predicted(some)[0], list(some)
+        while len(some) < min(KNOTS, len(score)):
+            solve = lambda right: np.linalg.solve(gram[np.ix_(some, some)] + floor, right)
+            floor = 1e-9 * np.trace(gram) * np.eye(len(some))
+            rest = score - gram[:, some] @ solve(score[some])
+            own = np.diag(gram) - np.einsum("ki,ik->k", gram[:, some], solve(gram[some]))
+            gain = np.where(own > 1e-9 * np.diag(gram), rest**2 / np.maximum(own, 1e-300), 0.0)
+            gain[some] = 0.0
+            some = [*some, int(np.argmax(gain))]
+            best = max(best, (self.predicted(some)[0], some), key=lambda each: each[0])
+        return best[1]
 
 
 def _quarter(force, x, times):

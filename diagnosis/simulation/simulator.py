@@ -272,7 +272,7 @@ class World:
         """
         spec, written = self.spec.copy(), {candidate: "mjcf" for candidate in setting}
         time_step_first = lambda item: (
-            item[0].effect.name != "time_step"
+            not item[0].effect.numerical
         )  # delays, lags and friction are written by it
         for candidate, values in sorted(Case(self.model, setting, 1).on, key=time_step_first):
             i = candidate.effect.id(self.model, candidate.place.name)
@@ -325,7 +325,7 @@ class Case:
         if any(when != conditions[0] for when in conditions):
             raise ValueError("effects under different conditions cannot be simulated together")
         self.when = conditions[0] if conditions else None
-        steps = [v[0] for c, v in self.on if c.effect.name == "time_step"]
+        steps = [v[0] for c, v in self.on if c.effect.numerical]
         self.step = (steps[0] if steps else model.opt.timestep) / refine
         self.structure = frozenset(c for c, _ in self.on if c.effect.overrides("build"))
         place = lambda c: c.effect.id(model, c.place.name)

@@ -15,7 +15,7 @@ class Named:
     def __init__(self, name, units):
         self.name = name
         overrides = {"overrides": lambda what: False}
-        self.effect = SimpleNamespace(simplicity=units - 1, name=name, **overrides)
+        self.effect = SimpleNamespace(simplicity=units - 1, name=name, numerical=False, **overrides)
         self.parameters = (None,)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from diagnosis.estimation.smoother import Trajectory
 from diagnosis.recordings.recording import Recording
-from diagnosis.selection.unmodelled_force import dependences, knots_of
+from diagnosis.selection.unmodelled_force import dependences, places_of
 from diagnosis.simulation.simulator import World
 
 ARM = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
@@ -100,8 +100,21 @@ def test_rows_in_contact_are_left_out():
     assert dependences(world, trajectory, runs) == []
 
 
+def test_a_curve_bends_where_its_force_does_and_nowhere_else():
+    def notch(q, v, u, t):
+        x = (q[:, 0] - 0.2) / 0.06  # of a travel of three
+        return at(0, -0.3 * x * np.exp(0.5 - 0.5 * x * x))
+
+    found = dependences(*made_up(notch))[0]
+    assert found.variables == ("position:j",) and found.share > 0.7
+    near = [k for k in found.candidate.effect.knots if abs(k - 0.2) < 0.25]
+    assert len(near) > 4
+    bent = dependences(*made_up(lambda q, v, u, t: at(0, -0.3 * np.maximum(q[:, 0], 0)), 0.1))[0]
+    assert bent.variables == ("position:j",) and len(bent.values) < 7
+
+
 def test_knots_lie_close_about_standstill():
     v = np.random.default_rng(0).normal(size=2000)
-    knots = knots_of(v, "velocity:j")
+    knots = places_of(v, "velocity:j")
     assert 0.0 in knots and min(np.diff(knots)) < 0.1 * max(np.diff(knots))
-    assert np.diff(knots_of(v, "position:j")) == pytest.approx(np.diff(knots_of(v, "time")))
+    assert np.diff(places_of(v, "position:j")) == pytest.approx(np.diff(places_of(v, "time")))
