@@ -84,11 +84,12 @@ def places(robot, effect):
         return [Spot(0)]
     if effect in OF_GROUND:
         return [Spot(0)] if robot.ground else []
-    if effect in OF_PAIRS:
+    if effect in OF_PAIRS:  # what two joints turn together has one unit
+        alike = lambda i, j: j in joints and robot.links[i].joint == robot.links[j].joint
         return [
             Spot(i, drives.get(i, -1), robot.links[i].parent)
             for i in joints
-            if robot.links[i].parent in joints
+            if alike(i, robot.links[i].parent)
         ]
     if effect == "link_length":
         return [Spot(i) for i in joints if robot.links[i].parent >= 0]
