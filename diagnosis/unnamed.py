@@ -83,20 +83,26 @@ def unknown(joint, outcome):
     }
 
 
-def beside(finding, name):
-    """A finding of an unknown force, with a name that it may have, that is written in its place and
-    that says what most of it varies with."""
-    other = {key: name[key] for key in ("effect", "place", "parameters")}
-    evidence, more = finding["evidence"], name["evidence"]
-    removed = evidence["held_out_error_removed"] + more["held_out_error_removed"]
-    p = min((x["p_value"] for x in (evidence, more) if x["p_value"] is not None), default=None)
-    written = finding["written_as"]
+def beside(finding, names):
+    """A finding of an unknown force, with the findings that it may be: they are written in its
+    place, and say what most of it varies with."""
+    every = [finding, *names]
+    named = [{key: name[key] for key in ("effect", "place", "parameters")} for name in names]
+    members = [other for name in names for other in name["also_possible"]]
+    told = [f["evidence"]["p_value"] for f in every if f["evidence"]["p_value"] is not None]
+    removed = sum(f["evidence"]["held_out_error_removed"] for f in every)
+    written = [f["written_as"] for f in every if f["written_as"] != "none"]
+    on = [variable for f in [*names, finding] for variable in f["depends_on"]]
     return {
         **finding,
-        "evidence": {**evidence, "held_out_error_removed": removed, "p_value": p},
-        "depends_on": list(dict.fromkeys(name["depends_on"] + finding["depends_on"]))[:MOST],
-        "written_as": name["written_as"] if written == "none" else written,
-        "also_possible": [*finding["also_possible"], other][:MOST],
+        "evidence": {
+            **finding["evidence"],
+            "held_out_error_removed": removed,
+            "p_value": min(told, default=None),
+        },
+        "depends_on": list(dict.fromkeys(on))[:MOST],
+        "written_as": written[0] if written else "none",
+        "also_possible": [*finding["also_possible"], *named, *members][:MOST],
     }
 
 
@@ -115,6 +121,7 @@ def led(world, outcome, findings, something):
     """
     leads = {f["place"]["name"]: f for _, f in findings if f["effect"] == "unknown"}
     order, shares = [], left(outcome.fitted)  # findings, and the joints of unknown forces
+    names = {}  # that these may have
     for candidate, finding in findings:
         joint = finding["place"]["name"] if finding["effect"] == "unknown" else None
         if candidate and joint is None:
@@ -124,7 +131,7 @@ def led(world, outcome, findings, something):
             edge = _at_edge(outcome, candidate)
             if at and (share > NEAREST or edge):
                 joint = at
-                leads[joint] = beside(leads.get(joint) or unknown(joint, outcome), finding)
+                names.setdefault(joint, []).append(finding)
             elif edge:
                 finding |= {"adequate": False}
         if joint is None:
@@ -132,6 +139,6 @@ def led(world, outcome, findings, something):
         elif joint not in order:
             order.append(joint)
     joint = missing_most(world, outcome) if something and not order else None
-    if joint is not None:
-        order, leads = [joint], {joint: unknown(joint, outcome)}
-    return [leads[each] if isinstance(each, str) else each for each in order]
+    order += [joint] if joint else []
+    force = lambda joint: beside(leads.get(joint) or unknown(joint, outcome), names.get(joint, []))
+    return [force(each) if isinstance(each, str) else each for each in order]

@@ -196,18 +196,6 @@ class Local:
         half[look.which] = t_ppf(0.975, freedom) * error[:k] * look.steps
         return chi2, half
 
-    def lasting(self, gain, curves):
-        """Whether a force that acts whenever the motion is like that gains half as much."""
-        scene, setting = self.scene, self.scene.setting
-        plain = scene.left([setting])[0]
-        for curve in curves:
-            if "time" in curve.variables or any("control" in name for name in curve.variables[1:]):
-                continue  # of two kinds at once, it is no simpler than an event
-            column = plain - scene.left([{**setting, curve.candidate: curve.values}])[0]
-            if (column * plain).sum() ** 2 > 0.5 * gain * max((column**2).sum(), 1e-300):
-                return True
-        return False
-
     def others(self, event, looks, found, gain):
         """((candidate, values), ...) of what explains an event as well, best first."""
         inside, out = self.inside, []

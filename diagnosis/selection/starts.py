@@ -18,6 +18,7 @@ LADDER = 0.1, 0.4  # shares of a prior's scale
 BEGUN = 0.1  # share of an amplitude's scale, at which effects of several values are begun
 STATES = 300  # of the motion, at which forces are compared
 PROMISING = 3  # groups of starts that are simulated
+STEP = 0.03  # share of a value's way from its nominal one, that a step from it is at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +148,11 @@ def _ladder(base, prior):
 
 
 def _proportional(candidate, base, prior, shown):
-    """The Start of small steps of the parameters that show, or None."""
+    """The Start of small steps of the parameters that show, or None. Where something touches,
+    predictions are rough: a tiny step tells of what it makes and breaks, and of no slope."""
     steps = np.array([p.step for p in candidate.parameters])
+    way = np.where(np.isfinite(candidate.nominal), base - candidate.nominal, 0.0)
+    steps = np.sign(steps) * np.maximum(abs(steps), STEP * abs(np.nan_to_num(way, posinf=0.0)))
     steps = np.where((base + steps > prior.high) | ~np.isfinite(steps), -abs(steps), steps)
     steps = np.where(base + steps < prior.low, abs(steps), steps)
     fits = (base + steps <= prior.high) & (base + steps >= prior.low) & np.isfinite(base) & shown

@@ -109,6 +109,15 @@ def test_names_that_share_a_joint_are_one_unknown_force():
     assert only["evidence"]["p_value"] == 1e-9
 
 
+def test_members_of_a_names_class_follow_all_names():
+    friction, stiffness = finding(FRICTION), finding(STIFFNESS)
+    friction[1]["also_possible"] = [{"effect": "dead_zone"}, {"effect": "gain"}]
+    given = outcome(smoothed(1.0), (1.0, 0.9), DEPENDS)
+    [only] = unnamed.led(WORLD, given, [friction, stiffness], True)
+    names = [o["effect"] for o in only["also_possible"]]
+    assert names == ["coulomb_friction", "stiffness", "dead_zone"]
+
+
 def test_a_curve_that_was_found_leads_the_names_at_its_joint():
     curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))
     known = finding(curve, written="python")
