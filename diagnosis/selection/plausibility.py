@@ -48,7 +48,7 @@ TABLE = {
     ],
     "backlash": [("travel", 0.05, 0.0, 0.3)],
     "gain": [("times", 0.25, 0.2, 5.0)],
-    "bias": [("strength", 0.3, -1.5, 1.5)],
+    "bias": [("force", 0.5, -2.0, 2.0)],  # in a drive on a joint it is a spring_offset
     "saturation": [("used", np.inf, 0.05, np.inf)],
     "torque_speed": [("plain", np.inf, 0.0, np.inf), ("used", np.inf, 0.05, np.inf)],
     "delay": [("plain", 0.03, 0.0, 0.15)],
@@ -157,7 +157,7 @@ class Usual:
             return size_of(model, model.body(place.name).id)
         if kind == "weight":
             return 10.0 * model.body_subtreemass[model.body(place.name).id]
-        if kind in ("used", "strength"):
+        if kind == "used":
             i = model.actuator(place.name).id
             used = np.quantile(ActuatorEffect.forces(model, i, self.recordings), 0.995)
             servo = model.actuator_biasprm[i, 1:3].any()
@@ -171,7 +171,7 @@ class Usual:
         if place.kind == "actuator":
             gear = abs(model.actuator_gear[model.actuator(place.name).id, 0]) or 1.0
         return {
-            "force": self.force[d],
+            "force": self.force[d] / gear,
             "inertia": model.dof_M0[d],
             "per speed": self.force[d] / self.speed[d] / gear**2,
             "per speed²": self.force[d] / self.speed[d] ** 2,
