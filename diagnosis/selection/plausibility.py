@@ -22,7 +22,7 @@ TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 #   missing: what the nominal model lacks in the joint, over the size of what a curve is times
 #   per speed, per travel: so much force at the joint's usual speed, or travel
 #   travel: the joint's recorded range          size, weight: the body's
-#   used, strength: the largest force that the controls ask for
+#   used: the largest force that the controls ask for
 TABLE = {
     "mass": [("times", 0.4, 0.05, 30.0)],
     "payload_change": [("times", 0.4, 0.3, 3.0)],
