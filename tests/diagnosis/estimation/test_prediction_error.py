@@ -1,6 +1,7 @@
 """The reported error, its curve and its floor against plain loops in stock MuJoCo."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -110,3 +111,19 @@ def test_floor_is_what_noise_does_to_a_perfect_simulator():
         scatter, rel=0.7
     )  # known from six runs to 30 % itself
     assert channels["qpos:pivot"] == pytest.approx(floor * NOISE)
+
+
+def test_velocities_that_are_late_differences_raise_the_floor_by_their_error():
+    run = recorded("run.csv", 5)
+    rate = np.gradient(run.qpos[:, 0], run.time)
+    late = np.array([rate[max(t - 8, 0) : t + 1].mean() for t in range(len(rate))])[:, None]
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    floors = []
+    for quality in (None, SimpleNamespace(differenced=["pivot"])):
+        told = replace(run, qvel=late, quality=quality)
+        smoother = Smoother(world, [told])
+        trajectory = smoother.locate({})
+        noise = np.array([NOISE])
+        floors.append(prediction_error.floor_error(world, {}, smoother, trajectory, noise)[0])
+        error, _ = prediction_error.prediction_error(world, {}, [told], noise)
+    assert floors[1] == pytest.approx(error, rel=0.2) and floors[0] < 0.8 * error
