@@ -25,8 +25,11 @@ from diagnosis.selection.identification import (
 )
 from diagnosis.selection.judge import Fitted
 from diagnosis.selection.plausibility import plausible
-from diagnosis.unnamed import NEAREST, UNNAMED
+from diagnosis.unnamed import UNNAMED
 
+# of the force that the names of a joint explain, from which on a curve is told beside them: on a
+# real machine every curve is significant
+INSTEAD = 0.5
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 
 
@@ -105,7 +108,7 @@ def _checked(search, found, fitted, others, log):
             continue
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
         size = _force(found, trajectory, world, rest.joint)
-        if not mine or rest.size > NEAREST * size:
+        if not mine or rest.size > INSTEAD * size:
             fitted = search.pruned(judge, beside) if mine else beside
         if rest.candidate in fitted.setting:
             break

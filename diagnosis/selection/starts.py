@@ -91,25 +91,13 @@ class Starts:
     def _promising(self, candidate, whole):
         """Of starts that come in groups, those of the groups whose force is most like the located
         one."""
-        t, world = self.trajectory, self.world
+        t = self.trajectory
         rows = np.flatnonzero(~t.free)
         rows = rows[windowing.evenly(len(rows), STATES)]
         if not len(rows):
             return whole
-        engine = world.engine(frozenset([candidate])).working
-        zero = list(whole[0])
-        zero[0] = 0.0
-        forces = []
-        moves = np.tanh(t.qvel[rows] / np.maximum(t.qvel_sd[rows], 1e-9))
-        for values in [zero, *whole]:
-            model = engine.edited([(candidate, tuple(values))], world.model.opt.timestep)
-            force = applied(model, t.qpos[rows], t.qvel[rows], engine)
-            if candidate.effect.overrides("limit"):
-                i = candidate.effect.id(world.model, candidate.place.name)
-                limit = candidate.effect.limit([world.model], i, np.array([values], float))
-                force = force - moves * limit(t.qpos[rows], t.qvel[rows], None, None, None)
-            forces.append(force)
-        none, *forces = forces
+        zero = [0.0, *whole[0][1:]]
+        none, *forces = [self._applied(candidate, values, rows) for values in [zero, *whole]]
         target, together, left = t.force[rows].ravel(), candidate.effect.together, []
         for k in range(0, len(whole), together):
             basis = np.stack([(f - none).ravel() for f in forces[k : k + together]], 1)
@@ -117,6 +105,20 @@ class Starts:
             left.append(np.sum((target - basis @ fit) ** 2))
         best = sorted(np.argsort(left)[:PROMISING])
         return [whole[k * together + i] for k in best for i in range(together)]
+
+    def _applied(self, candidate, values, rows):
+        """Generalized forces (n, nv) of actuators and joints with a candidate, dry friction
+        included, in rows (n,) of the trajectory."""
+        world, t = self.world, self.trajectory
+        engine = world.engine(frozenset([candidate])).working
+        model = engine.edited([(candidate, tuple(values))], world.model.opt.timestep)
+        force = applied(model, t.qpos[rows], t.qvel[rows], engine)
+        if candidate.effect.overrides("limit"):
+            i = candidate.effect.id(world.model, candidate.place.name)
+            limit = candidate.effect.limit([world.model], i, np.array([values], float))
+            moves = np.tanh(t.qvel[rows] / np.maximum(t.qvel_sd[rows], 1e-9))
+            force = force - moves * limit(t.qpos[rows], t.qvel[rows], None, None, None)
+        return force
 
 
 def _full(candidate, base, rows, prior):

@@ -150,11 +150,11 @@ class Sums:
         self.score = np.array([basis[p].T @ force[p] for p in parts])
         self.square, self.number = np.sum(force**2), len(force)
 
-    def _solved(self, gram, score):
-        ridge = 1e-5 * np.trace(gram, axis1=-2, axis2=-1)[..., None, None] / gram.shape[-1]
-        return np.linalg.solve(gram + (ridge + 1e-300) * np.eye(gram.shape[-1]), score[..., None])[
-            ..., 0
-        ]
+    @staticmethod
+    def _solved(gram, score):
+        size = gram.shape[-1]
+        ridge = 1e-5 * np.trace(gram, axis1=-2, axis2=-1)[..., None, None] / size + 1e-300
+        return np.linalg.solve(gram + ridge * np.eye(size), score[..., None])[..., 0]
 
     def amounts(self, some):
         """(p,) of columns some (p,) that fit the force."""
@@ -175,13 +175,18 @@ class Sums:
         gram, score = self.gram.sum(0), self.score.sum(0)
         some = [0, 1]
         best = self.predicted(some)[0], list(some)
+        floor = (1e-9 * np.trace(gram) + 1e-300) * np.eye(len(gram))
         while len(some) < min(KNOTS, len(score)):
-            solve = lambda right: np.linalg.solve(gram[np.ix_(some, some)] + floor, right)
-            floor = 1e-9 * np.trace(gram) * np.eye(len(some))
-            rest = score - gram[:, some] @ solve(score[some])
-            own = np.diag(gram) - np.einsum("ki,ik->k", gram[:, some], solve(gram[some]))
+            inside = gram[np.ix_(some, some)] + floor[: len(some), : len(some)]
+            shared = np.linalg.solve(inside, gram[some]).T  # of each column, what those hold
+            rest, own = (
+                score - shared @ score[some],
+                np.diag(gram) - (shared * gram[:, some]).sum(1),
+            )
             gain = np.where(own > 1e-9 * np.diag(gram), rest**2 / np.maximum(own, 1e-300), 0.0)
             gain[some] = 0.0
+            if not gain.any():
+                break
             some = [*some, int(np.argmax(gain))]
             best = max(best, (self.predicted(some)[0], some), key=lambda each: each[0])
         return best[1]

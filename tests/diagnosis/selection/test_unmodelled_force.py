@@ -1,5 +1,7 @@
 """What a located force depends on: right on made-up motions, nothing on noise."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -92,6 +94,14 @@ def test_what_stands_out_of_what_is_known_comes_first():
 def test_noise_depends_on_nothing():
     for seed in range(5):
         assert dependences(*made_up(lambda q, v, u, t: np.zeros((ROWS, 2)), seed=seed)) == []
+
+
+def test_a_drive_that_is_asked_for_nothing_multiplies_no_curve():
+    world, trajectory, [run] = made_up(lambda q, v, u, t: at(0, 0.3 * np.sin(4 * q[:, 0])))
+    idle = replace(run, ctrl=np.zeros_like(run.ctrl))
+    trajectory = replace(trajectory, first={idle: 0})
+    found = dependences(world, trajectory, [idle], most=None)
+    assert found and not any("control:m" in d.variables for d in found)
 
 
 def test_rows_in_contact_are_left_out():
