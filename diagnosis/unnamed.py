@@ -84,15 +84,16 @@ def unknown(joint, outcome):
 
 
 def beside(finding, names):
-    """A finding of an unknown force, with the findings that it may be: they are written in its
-    place, and say what most of it varies with."""
+    """A finding of an unknown force, with the findings that it may be and that are written in its
+    place. It depends on what its curve does, if it has one, then on what they do."""
     every = [finding, *names]
     named = [{key: name[key] for key in ("effect", "place", "parameters")} for name in names]
     members = [other for name in names for other in name["also_possible"]]
     told = [f["evidence"]["p_value"] for f in every if f["evidence"]["p_value"] is not None]
     removed = sum(f["evidence"]["held_out_error_removed"] for f in every)
     written = [f["written_as"] for f in every if f["written_as"] != "none"]
-    on = [variable for f in [*names, finding] for variable in f["depends_on"]]
+    order = every if "curve" in finding else [*names, finding]
+    on = [variable for f in order for variable in f["depends_on"]]
     return {
         **finding,
         "evidence": {

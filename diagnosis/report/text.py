@@ -362,7 +362,7 @@ def nearest_only(finding: dict) -> str:
         return "none of its values shows"
     if all(p["low"] <= (p["nominal"] or 0.0) <= p["high"] for p in seen):
         return "its intervals hold the nominal values"
-    return "much of the error is left"
+    return "its value lies at the edge of what was tried"
 
 
 def sentence(words: str) -> str:

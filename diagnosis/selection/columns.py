@@ -47,8 +47,11 @@ class Option(Start):
         """(precision, pull) (p,) of the prior about the base, for the criterion."""
         # where the start is: far out a Student's t bends little
         k = np.array(self.prior.precision(self.base + self.directions.sum(0)))
-        precision = (self.directions**2 * k).sum(1)
-        pull = -(self.directions * k * (self.base - self.prior.centre)).sum(1)
+        moved = self.directions
+        if self.merges:  # of what is worked out together, the amounts tell the amplitude alone
+            moved = moved * (np.arange(moved.shape[1]) < self.candidate.effect.amplitudes)
+        precision = (moved**2 * k).sum(1)
+        pull = -(moved * k * (self.base - self.prior.centre)).sum(1)
         return precision, pull
 
 

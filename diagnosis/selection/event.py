@@ -16,6 +16,7 @@ from diagnosis.estimation import windowing
 SPAN = 0.2  # s, of a window
 LONGER = 2.5  # of it, windows in which ends and values are fitted
 SAME = 1.1  # squared residual around an event, up to which another effect may stand in its place
+LASTING = 0.5  # share of the event's gain, and of the force, from which on a lasting force is it
 ALIKE = 0.8  # of the event's gain, what another effect must gain to be looked at
 
 
@@ -195,6 +196,19 @@ class Local:
         half = np.zeros(len(values))
         half[look.which] = t_ppf(0.975, freedom) * error[:k] * look.steps
         return chi2, half
+
+    def lasting(self, gain, curves):
+        """Whether a force that acts whenever the motion is like that gains half as much, and is
+        predicted as far where it was not fitted."""
+        scene, setting = self.scene, self.scene.setting
+        plain = scene.left([setting])[0]
+        for curve in curves:
+            if "time" in curve.variables or curve.share < LASTING:
+                continue
+            column = plain - scene.left([{**setting, curve.candidate: curve.values}])[0]
+            if (column * plain).sum() ** 2 > LASTING * gain * max((column**2).sum(), 1e-300):
+                return True
+        return False
 
     def others(self, event, looks, found, gain):
         """((candidate, values), ...) of what explains an event as well, best first."""

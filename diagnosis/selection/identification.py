@@ -198,8 +198,9 @@ class Identification:
         return after.loss < before.loss and self.no_chance(paired(before.score, after.score))
 
     def no_chance(self, step):
-        """Whether a Comparison is significant among all candidates, with two tests each."""
-        return step.p_value < LEVEL / len(self.candidates) / 2
+        """Whether a Comparison is significant among all candidates and curves, with two tests
+        each."""
+        return step.p_value < LEVEL / (len(self.candidates) + CURVES) / 2
 
     def pruned(self, judge, fitted):
         """Without the effects that do not earn their place beside the others. Those that small

@@ -157,7 +157,7 @@ class Usual:
             return size_of(model, model.body(place.name).id)
         if kind == "weight":
             return 10.0 * model.body_subtreemass[model.body(place.name).id]
-        if kind == "used":
+        if kind == "used" or (kind == "force" and place.kind == "actuator" and d is None):
             i = model.actuator(place.name).id
             used = np.quantile(ActuatorEffect.forces(model, i, self.recordings), 0.995)
             servo = model.actuator_biasprm[i, 1:3].any()

@@ -153,8 +153,9 @@ def _proportional(candidate, base, prior, shown):
     """The Start of small steps of the parameters that show, or None. Where something touches,
     predictions are rough: a tiny step tells of what it makes and breaks, and of no slope."""
     steps = np.array([p.step for p in candidate.parameters])
-    way = np.where(np.isfinite(candidate.nominal), base - candidate.nominal, 0.0)
-    steps = np.sign(steps) * np.maximum(abs(steps), STEP * abs(np.nan_to_num(way, posinf=0.0)))
+    finite = np.isfinite(base) & np.isfinite(candidate.nominal)
+    way = np.subtract(base, candidate.nominal, out=np.zeros_like(base), where=finite)
+    steps = np.sign(steps) * np.maximum(abs(steps), STEP * abs(way))
     steps = np.where((base + steps > prior.high) | ~np.isfinite(steps), -abs(steps), steps)
     steps = np.where(base + steps < prior.low, abs(steps), steps)
     fits = (base + steps <= prior.high) & (base + steps >= prior.low) & np.isfinite(base) & shown

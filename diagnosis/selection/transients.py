@@ -24,7 +24,6 @@ LEVEL = 1e-3  # false-alarm rate, shared between all intervals and effects
 MOST = 400  # windows that are looked at, those about the largest located force
 CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the event must explain
 ALONE = 0.9  # of an event's gain, the share of one window, above which that window is odd
-LASTING = 0.5  # share of the located force that a curve predicts, from which on it is no event
 LONGEST = 0.6  # of a recording: what lasts longer is no event
 TRIES = 50  # intervals that are looked at closer
 UNSEEN = 1e-8  # squared size, in noises, of a step that shows nowhere
@@ -64,9 +63,9 @@ def find(world, recordings, setting, trajectory, noise):
     if p > LEVEL or gain < CONCENTRATED * excess or not _worth(look, scene, chi2, a, gain):
         return None
     local = Local(scene, trajectory, chi2, a, b)
-    event = local.event(look, min(float(p), 1.0))
-    if any(map(_lasting, dependences(world, trajectory, recordings))):
+    if local.lasting(gain, dependences(world, trajectory, recordings, most=None)):
         return None
+    event = local.event(look, min(float(p), 1.0))
     return replace(event, others=local.others(event, looks, look, gain))
 
 
@@ -75,15 +74,6 @@ def _worth(look, scene, chi2, a, gain):
     own = [w.recording is scene.windows[a].recording for w in scene.windows]
     removed = np.log(chi2[own].sum() / max(chi2[own].sum() - gain, 1e-300)) / 2
     return removed > PRICE * complexity([look.timed])
-
-
-def _lasting(curve):
-    """Whether a located force is one that acts whenever the motion is like that. Over time it is
-    none, and of what a drive is asked for and something else at once it is no simpler than an
-    event."""
-    variables = curve.variables
-    simple = "time" not in variables and not any("control" in name for name in variables[1:])
-    return simple and curve.share > LASTING
 
 
 def _loudest(trajectory, windows):

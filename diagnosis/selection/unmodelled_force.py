@@ -30,7 +30,7 @@ CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 @dataclass(frozen=True)
 class Dependence:
     """share: of the located force's variance at the joint that the curve predicts in stretches left
-    out; size: RMS of what it predicts; candidate, values: the curve and the forces at its knots."""
+    out; size: RMS of so much of it; candidate, values: the curve and the forces at its knots."""
 
     joint: str
     variables: tuple
@@ -42,7 +42,7 @@ class Dependence:
 
 @dataclass(frozen=True)
 class Curve:
-    """share: of the force's variance, predicted on blocks left out; rms: of what is predicted."""
+    """share: of the force's variance, predicted on blocks left out; rms: of so much of it."""
 
     share: float
     rms: float
@@ -129,67 +129,80 @@ def _explained(force, x, times, block, variable, wave=False):
         knots = _quarter(force, x, times)
         turn = np.pi / 2 * (x - knots[0]) / (knots[1] - knots[0])
         sums = Sums(np.stack([np.cos(turn), np.sin(turn)], 1) * times[:, None], force, block)
-        return Curve(*sums.predicted([0, 1]), knots, sums.amounts([0, 1]))
+        return Curve(*sums.predicted(2), knots, sums.amounts([0, 1]))
     places = places_of(x, variable)
     low, span = places[0], places[-1] - places[0]
     bends = lambda at: np.maximum((at[:, None] - places[:-1]) / span, 0.0)
     shape = lambda at: np.column_stack([np.ones(len(at)), bends(np.clip(at, low, places[-1]))])
     sums = Sums(shape(x) * times[:, None], force, block)
-    chosen = sums.chosen()
+    size = max(range(2, KNOTS + 1), key=lambda size: sums.predicted(size)[0])
+    chosen = sums.chosen(size)
     knots = places[[0, *sorted(k - 1 for k in chosen[2:]), -1]]
     curve = shape(knots)[:, chosen] @ sums.amounts(chosen)
-    return Curve(*sums.predicted(chosen), knots, curve)
+    return Curve(*sums.predicted(size), knots, curve)
 
 
 class Sums:
-    """Of products of a basis (n, k) with itself and with a force (n,), in blocks (n,) of rows."""
+    """Gram matrices and scores of a basis (n, k) with a force (n,), by blocks (n,) of rows. Columns
+    are taken in turn: the first two, and each next one that which explains most beside those."""
 
     def __init__(self, basis, force, block):
         parts = [slice(*np.searchsorted(block, [b, b + 1])) for b in range(block.max() + 1)]
         self.gram = np.array([basis[p].T @ basis[p] for p in parts])
         self.score = np.array([basis[p].T @ force[p] for p in parts])
         self.square, self.number = np.sum(force**2), len(force)
+        others = self.gram.sum(0) - self.gram, self.score.sum(0) - self.score
+        self.without = self._taken(*others, min(KNOTS, basis.shape[1]))
+        self.left = [self._left(*others, some) for some in self.without]
 
     @staticmethod
-    def _solved(gram, score):
-        size = gram.shape[-1]
-        ridge = 1e-5 * np.trace(gram, axis1=-2, axis2=-1)[..., None, None] / size + 1e-300
-        return np.linalg.solve(gram + ridge * np.eye(size), score[..., None])[..., 0]
+    def _taken(gram, score, most):
+        """[(b, size)] columns for gram (b, k, k) and score (b, k), of sizes from two on."""
+        b = np.arange(len(gram))[:, None]
+        own, out = np.einsum("bii->bi", gram), [np.tile([0, 1], (len(gram), 1))]
+        while out[-1].shape[1] < most:
+            some = out[-1]
+            inside, beside = gram[b[..., None], some[:, :, None], some[:, None]], gram[b, some]
+            share = np.swapaxes(_solved(inside, beside), 1, 2)  # of each column, what those hold
+            rest = score - (share @ score[b, some][..., None])[..., 0]
+            free = own - (share * np.swapaxes(beside, 1, 2)).sum(2)
+            gain = np.where(free > 1e-9 * own, rest**2 / np.maximum(free, 1e-300), 0.0)
+            gain[b, some] = 0.0
+            out.append(np.concatenate([some, gain.argmax(1)[:, None]], 1))
+        return out
+
+    def _left(self, gram, score, some):
+        """Squares that columns some (b, size), fitted to all other blocks, leave of the force."""
+        b = np.arange(len(gram))[:, None]
+        pair = b[..., None], some[:, :, None], some[:, None]
+        z = _solved(gram[pair], score[b, some][..., None])[..., 0]
+        cross = np.sum(z * self.score[b, some])
+        return self.square - 2 * cross + np.einsum("bi,bij,bj->", z, self.gram[pair], z)
+
+    def predicted(self, size):
+        """(share of the force's variance that so many columns predict in each block, chosen and
+        fitted without it, RMS of that)."""
+        left = self.left[min(size, len(self.left) + 1) - 2]
+        share = float(1 - left / self.square) if self.square > 0 else 0.0
+        return share, float(np.sqrt(max(share, 0.0) * self.square / max(self.number, 1)))
+
+    def chosen(self, size):
+        """So many columns, or fewer where no more explain anything."""
+        gram, score = self.gram.sum(0)[None], self.score.sum(0)[None]
+        *_, some = self._taken(gram, score, min(size, gram.shape[-1]))
+        return [0, 1, *(int(k) for k in some[0, 2:] if k > 1)]
 
     def amounts(self, some):
         """(p,) of columns some (p,) that fit the force."""
-        return self._solved(self.gram.sum(0)[np.ix_(some, some)], self.score.sum(0)[some])
+        gram, score = self.gram.sum(0)[np.ix_(some, some)], self.score.sum(0)[some]
+        return _solved(gram[None], score[None, :, None])[0, :, 0]
 
-    def predicted(self, some):
-        """(share of the force's variance that columns some (p,) predict in each block from all the
-        others, RMS of that)."""
-        gram, score = self.gram[:, some][:, :, some], self.score[:, some]
-        z = self._solved(gram.sum(0) - gram, score.sum(0) - score)
-        left = self.square - 2 * np.sum(z * score) + np.einsum("bi,bij,bj->", z, gram, z)
-        share = float(1 - left / (self.square + 1e-300))
-        return share, float(np.sqrt(max(share, 0.0) * self.square / self.number))
 
-    def chosen(self):
-        """The columns [0, 1, ...], each next one that which explains most beside those before, as
-        many as predict best."""
-        gram, score = self.gram.sum(0), self.score.sum(0)
-        some = [0, 1]
-        best = self.predicted(some)[0], list(some)
-        floor = (1e-9 * np.trace(gram) + 1e-300) * np.eye(len(gram))
-        while len(some) < min(KNOTS, len(score)):
-            inside = gram[np.ix_(some, some)] + floor[: len(some), : len(some)]
-            shared = np.linalg.solve(inside, gram[some]).T  # of each column, what those hold
-            rest, own = (
-                score - shared @ score[some],
-                np.diag(gram) - (shared * gram[:, some]).sum(1),
-            )
-            gain = np.where(own > 1e-9 * np.diag(gram), rest**2 / np.maximum(own, 1e-300), 0.0)
-            gain[some] = 0.0
-            if not gain.any():
-                break
-            some = [*some, int(np.argmax(gain))]
-            best = max(best, (self.predicted(some)[0], some), key=lambda each: each[0])
-        return best[1]
+def _solved(gram, right):
+    """x (b, k, m) of gram (b, k, k) x = right (b, k, m), with a ridge that keeps it finite."""
+    size = gram.shape[-1]
+    ridge = 1e-8 * np.trace(gram, axis1=1, axis2=2)[:, None, None] / size + 1e-300
+    return np.linalg.solve(gram + ridge * np.eye(size), right)
 
 
 def _quarter(force, x, times):

@@ -84,13 +84,12 @@ def places(robot, effect):
         return [Spot(0)]
     if effect in OF_GROUND:
         return [Spot(0)] if robot.ground else []
-    if effect in OF_PAIRS:  # what two joints turn together has one unit
-        alike = lambda i, j: j in joints and robot.links[i].joint == robot.links[j].joint
-        return [
-            Spot(i, drives.get(i, -1), robot.links[i].parent)
-            for i in joints
-            if alike(i, robot.links[i].parent)
-        ]
+    if effect in OF_PAIRS:
+        parent = lambda i: robot.links[i].parent
+        pairs = [i for i in joints if parent(i) in joints]
+        if effect.startswith("coupled"):  # what two joints turn together has one unit
+            pairs = [i for i in pairs if robot.links[i].joint == robot.links[parent(i)].joint]
+        return [Spot(i, drives.get(i, -1), parent(i)) for i in pairs]
     if effect == "link_length":
         return [Spot(i) for i in joints if robot.links[i].parent >= 0]
     if effect in OF_BODIES:

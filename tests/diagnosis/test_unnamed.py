@@ -121,11 +121,14 @@ def test_members_of_a_names_class_follow_all_names():
 def test_a_curve_that_was_found_leads_the_names_at_its_joint():
     curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))
     known = finding(curve, written="python")
-    known[1]["depends_on"] = ["position:elbow"]
-    given = [finding(FRICTION), known]
+    known[1].update(depends_on=["position:elbow"], curve={})
+    friction = finding(FRICTION)
+    friction[1]["depends_on"] = ["velocity:elbow"]
+    given = [friction, known]
     told = unnamed.led(WORLD, outcome(smoothed(1.0), (1.0, 0.9), DEPENDS), given, True)
     [only] = told
-    assert only["depends_on"] == ["position:elbow"] and only["written_as"] == "python"
+    assert only["depends_on"] == ["position:elbow", "velocity:elbow"]
+    assert only["written_as"] == "python"
     assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
 
 

@@ -159,7 +159,7 @@ def test_a_summary_for_each_joint_is_a_table(diagnosis):
 def test_doubts_stand_beside_the_name(diagnosis):
     page = sections.html_page(diagnosis)
     for words in (
-        "The nearest name only: much of the error is left.",
+        "The nearest name only: its value lies at the edge of what was tried.",
         "Hard to believe: 1.1 times the nominal value.",
         "The recordings do not agree on one value: p 1.0e-5.",
         "0.130 (0.100 to 0.140) N·m",

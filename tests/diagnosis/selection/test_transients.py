@@ -79,3 +79,28 @@ def test_a_push_that_is_certain_but_changes_little_is_no_event(monkeypatch):
 )
 def test_what_lasts_is_no_event(push):
     assert found([recorded(f"run{i}.csv", i, push=push) for i in range(2)]) is None
+
+
+TWO = """<mujoco><worldbody>
+  <body><joint name="a" axis="0 1 0" damping=".05"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".5" contype="0"/></body>
+  <body pos="1 0 0"><joint name="b" axis="0 1 0" damping=".05"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".5" contype="0"/></body>
+  </worldbody></mujoco>"""
+
+
+def test_a_lasting_force_at_another_joint_hides_no_event():
+    world, time = World(mujoco.MjSpec.from_string(TWO)), 0.01 * np.arange(500)
+    data, rng, qpos = mujoco.MjData(world.model), np.random.default_rng(0), np.empty((500, 2))
+    data.qpos[:] = 1.2, -0.9
+    for t in range(500):
+        qpos[t] = data.qpos
+        push = 0.5 * (2.0 < time[t] < 2.6), -0.02 * np.tanh(data.qvel[1] / 0.01)
+        for _ in range(5):
+            data.qfrc_applied[:] = push
+            mujoco.mj_step(world.model, data)
+    noisy = qpos + 1e-4 * rng.normal(size=qpos.shape)
+    run = Recording("run.csv", time, noisy, np.full((500, 2), np.nan), np.zeros((500, 0)), {})
+    smoother = Smoother(world, [run])
+    event = transients.find(world, [run], {}, smoother.locate({}), smoother.position_noise)
+    assert event is not None and event.time == pytest.approx((2.0, 2.6), abs=0.15)

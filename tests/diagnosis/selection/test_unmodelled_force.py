@@ -8,7 +8,7 @@ import pytest
 
 from diagnosis.estimation.smoother import Trajectory
 from diagnosis.recordings.recording import Recording
-from diagnosis.selection.unmodelled_force import dependences, places_of
+from diagnosis.selection.unmodelled_force import LEAST, _explained, dependences, places_of
 from diagnosis.simulation.simulator import World
 
 ARM = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
@@ -116,11 +116,22 @@ def test_a_curve_bends_where_its_force_does_and_nowhere_else():
         return at(0, -0.3 * x * np.exp(0.5 - 0.5 * x * x))
 
     found = dependences(*made_up(notch))[0]
-    assert found.variables == ("position:j",) and found.share > 0.7
+    assert found.variables == ("position:j",) and found.share > 0.75
     near = [k for k in found.candidate.effect.knots if abs(k - 0.2) < 0.25]
     assert len(near) > 4
     bent = dependences(*made_up(lambda q, v, u, t: at(0, -0.3 * np.maximum(q[:, 0], 0)), 0.1))[0]
     assert bent.variables == ("position:j",) and len(bent.values) < 7
+
+
+def test_chosen_knots_predict_no_force_that_wanders_by_itself():
+    """Smooth noise beside a smooth motion: knots that are chosen where they are judged predict
+    a share of it in a third of the cases."""
+    rng, smooth, seen = np.random.default_rng(0), np.ones(25) / 25, []
+    block = np.arange(2000) * 16 // 2000
+    for _ in range(30):
+        x, force = (np.convolve(rng.normal(size=2024), smooth, "valid") for _ in range(2))
+        seen.append(_explained(force, x, np.ones(2000), block, "position:j").share > LEAST)
+    assert np.mean(seen) < 0.15
 
 
 def test_knots_lie_close_about_standstill():

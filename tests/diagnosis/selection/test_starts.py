@@ -1,0 +1,67 @@
+"""Where effects are begun: how large steps are, and which waves the located force chooses."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from plants import DRIVEN_PENDULUM, recorded
+
+from diagnosis.effects.friction import TURNS
+from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.selection.starts import STEP, Starts
+from diagnosis.simulation.simulator import World
+
+
+@pytest.fixture(scope="module")
+def machine():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded("run.csv", 3)]
+    return world, Usual(world, runs, np.ones(1))
+
+
+@pytest.mark.parametrize("effect", ["quadratic_damping", "mass"])
+def test_steps_from_a_far_value_are_a_share_of_its_way(machine, effect):
+    world, usual = machine
+    candidate = next(c for c in world.candidates if c.effect.name == effect)
+    way = (plausible(candidate, usual).high[0] - candidate.nominal[0]) / 2
+    far = candidate.nominal[0] + way
+    [start] = Starts(world, {candidate: (far,)}, usual).of([candidate])
+    assert abs(start.directions[0, 0]) == pytest.approx(STEP * way)
+    near = Starts(world, {candidate: candidate.nominal}, usual).of([candidate])[0]
+    assert abs(near.directions[0, 0]) == pytest.approx(abs(candidate.parameters[0].step))
+
+
+def test_a_stop_on_one_side_has_a_step_for_that_side_alone(machine):
+    world, usual = machine
+    stop = world.candidate("joint_stop", "pivot")
+    with np.errstate(all="raise"):
+        [start] = Starts(world, {stop: (-0.5, np.inf)}, usual).of([stop])
+    assert (start.directions != 0).tolist() == [[True, False]]
+
+
+def test_a_friction_map_begins_at_the_wave_of_the_located_force(machine):
+    world, usual = machine
+    friction = world.candidate("friction_map", "pivot")
+    angle = np.linspace(0, 40, 600)
+    q, v = 0.8 * np.sin(angle)[:, None], 0.8 * np.cos(angle)[:, None]
+    waves = 9.0
+    travel = np.ptp(np.quantile(usual.recordings[0].qpos, [0.02, 0.98]))
+    force = -np.sign(v) * (0.2 + 0.15 * np.sin(waves * q + 1.0))
+    free = np.zeros(len(q), bool)
+    trajectory = SimpleNamespace(qpos=q, qvel=v, force=force, qvel_sd=1e-3 + 0 * v, free=free)
+    starts = Starts(world, {}, usual, trajectory=trajectory).of([friction])
+    begun = {start.base[2] + start.directions[0, 2] for start in starts}
+    nearest = TURNS[np.argmin(abs(TURNS / travel - waves))] / travel
+    assert any(abs(n - nearest) < 1e-3 for n in begun) and len(begun) == 3
+    assert all(start.merges and len(start.directions) == 3 for start in starts)
+
+
+def test_a_drives_bias_is_as_plausible_as_the_springs_offset_that_it_equals(machine):
+    world, usual = machine
+    bias, offset = (
+        plausible(world.candidate(*c), usual)
+        for c in (("bias", "drive"), ("spring_offset", "pivot"))
+    )
+    for field in ("scale", "low", "high"):
+        np.testing.assert_allclose(getattr(bias, field), getattr(offset, field))
