@@ -18,7 +18,7 @@ LADDER = 0.1, 0.4  # shares of a prior's scale
 BEGUN = 0.1  # share of an amplitude's scale, at which effects of several values are begun
 STATES = 300  # of the motion, at which forces are compared
 PROMISING = 3  # groups of starts that are simulated
-STEP = 0.03  # share of a value's way from its nominal one, that a step from it is at least
+STEP = 0.03  # share of a value's prior scale, or its way from nominal, that a step is at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,8 @@ def _proportional(candidate, base, prior, shown):
     steps = np.array([p.step for p in candidate.parameters])
     finite = np.isfinite(base) & np.isfinite(candidate.nominal)
     way = np.subtract(base, candidate.nominal, out=np.zeros_like(base), where=finite)
-    steps = np.sign(steps) * np.maximum(abs(steps), STEP * abs(way))
+    usual = np.where(np.isfinite(prior.scale), prior.scale, 0.0)
+    steps = np.sign(steps) * np.maximum(abs(steps), STEP * np.maximum(abs(way), usual))
     steps = np.where((base + steps > prior.high) | ~np.isfinite(steps), -abs(steps), steps)
     steps = np.where(base + steps < prior.low, abs(steps), steps)
     fits = (base + steps <= prior.high) & (base + steps >= prior.low) & np.isfinite(base) & shown

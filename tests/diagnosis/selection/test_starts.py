@@ -24,12 +24,14 @@ def machine():
 def test_steps_from_a_far_value_are_a_share_of_its_way(machine, effect):
     world, usual = machine
     candidate = next(c for c in world.candidates if c.effect.name == effect)
-    way = (plausible(candidate, usual).high[0] - candidate.nominal[0]) / 2
+    prior = plausible(candidate, usual)
+    way = (prior.high[0] - candidate.nominal[0]) / 2
     far = candidate.nominal[0] + way
     [start] = Starts(world, {candidate: (far,)}, usual).of([candidate])
     assert abs(start.directions[0, 0]) == pytest.approx(STEP * way)
     near = Starts(world, {candidate: candidate.nominal}, usual).of([candidate])[0]
-    assert abs(near.directions[0, 0]) == pytest.approx(abs(candidate.parameters[0].step))
+    least = max(abs(candidate.parameters[0].step), STEP * prior.scale[0])
+    assert abs(near.directions[0, 0]) == pytest.approx(least)
 
 
 def test_a_stop_on_one_side_has_a_step_for_that_side_alone(machine):
