@@ -31,8 +31,8 @@ from diagnosis.effects.joints import (
 MOST_FALL = 5.0  # times the friction of motion, that of rest at most: dry surfaces reach 2 to 3
 FALLS = 0.05
 SELF_LOCKING = 2.0  # share of the load beyond which no drive would turn
-# radians of a friction map's wave over the travel, to try first: of one of them the truth stays in
-# step with it from end to end
+# radians that a friction map's wave turns over the travel, to try first: so close to each other
+# that one of them stays in step with the true wave from end to end
 TURNS = np.arange(3.25, 40.0, 3.0)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from diagnosis.effects.base import runge_kutta
 from diagnosis.estimation import windowing
+from diagnosis.simulation.simulator import step_of
 
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
 FEWEST = 16  # windows that there should be, if shorter ones make up for it
@@ -132,8 +133,7 @@ class Ahead:
         Where positions move by a step's new velocity, a velocity is that of half a step before its
         time: with a shorter step it is a later one than that which was located.
         """
-        steps = [v[0] for c, v in setting.items() if c.effect.numerical]
-        step = (steps[0] if steps else self.model.opt.timestep) / refine
+        step = step_of(self.model, setting) / refine
         if step == self.step or runge_kutta(self.model):
             return self.qvel
         rest = with_own_step(setting)

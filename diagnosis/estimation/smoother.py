@@ -66,6 +66,10 @@ class Trajectory:
         """The slice of a recording's rows."""
         return slice(self.first[recording], self.first[recording] + len(recording.time))
 
+    def direction(self):
+        """The sign of each velocity (rows, nv), as friction has it, as far as it is known."""
+        return np.tanh(self.qvel / np.maximum(self.qvel_sd, 1e-9))
+
     def located(self):
         """(RMS (nv,) of the force, and of its standard deviation), where nothing touches."""
         rows = ~self.free

@@ -110,14 +110,15 @@ class Starts:
         """Generalized forces (n, nv) of actuators and joints with a candidate, dry friction
         included, in rows (n,) of the trajectory."""
         world, t = self.world, self.trajectory
-        engine = world.engine(frozenset([candidate])).working
+        structure = [candidate] if candidate.effect.overrides("build") else []
+        engine = world.engine(frozenset(structure)).working
         model = engine.edited([(candidate, tuple(values))], world.model.opt.timestep)
         force = applied(model, t.qpos[rows], t.qvel[rows], engine)
         if candidate.effect.overrides("limit"):
             i = candidate.effect.id(world.model, candidate.place.name)
             limit = candidate.effect.limit([world.model], i, np.array([values], float))
-            moves = np.tanh(t.qvel[rows] / np.maximum(t.qvel_sd[rows], 1e-9))
-            force = force - moves * limit(t.qpos[rows], t.qvel[rows], None, None, None)
+            most = limit(t.qpos[rows], t.qvel[rows], None, None, None)
+            force = force - t.direction()[rows] * most
         return force
 
 

@@ -102,8 +102,7 @@ def _factors(model, trajectory, ctrl, j, variable):
     name, out = windowing.joint_name(model, j), {None: np.ones(len(ctrl))}
     d = model.jnt_dofadr[j]
     if variable in ("time", f"position:{name}"):
-        speed, sd = trajectory.qvel[:, d], np.maximum(trajectory.qvel_sd[:, d], 1e-9)
-        out[f"velocity:{name}"] = np.tanh(speed / sd)
+        out[f"velocity:{name}"] = trajectory.direction()[:, d]
     if variable in ("time", f"position:{name}", f"velocity:{name}"):
         for a in drives_of(model, j):
             times = asked(model, a, trajectory.qpos, trajectory.qvel, ctrl)
@@ -162,7 +161,7 @@ class Sums:
         own, out = np.einsum("bii->bi", gram), [np.tile([0, 1], (len(gram), 1))]
         while out[-1].shape[1] < most:
             some = out[-1]
-            inside, beside = gram[b[..., None], some[:, :, None], some[:, None]], gram[b, some]
+            inside, beside = _among(gram, some), gram[b, some]
             share = np.swapaxes(_solved(inside, beside), 1, 2)  # of each column, what those hold
             rest = score - (share @ score[b, some][..., None])[..., 0]
             free = own - (share * np.swapaxes(beside, 1, 2)).sum(2)
@@ -174,10 +173,9 @@ class Sums:
     def _left(self, gram, score, some):
         """Squares that columns some (b, size), fitted to all other blocks, leave of the force."""
         b = np.arange(len(gram))[:, None]
-        pair = b[..., None], some[:, :, None], some[:, None]
-        z = _solved(gram[pair], score[b, some][..., None])[..., 0]
+        z = _solved(_among(gram, some), score[b, some][..., None])[..., 0]
         cross = np.sum(z * self.score[b, some])
-        return self.square - 2 * cross + np.einsum("bi,bij,bj->", z, self.gram[pair], z)
+        return self.square - 2 * cross + np.einsum("bi,bij,bj->", z, _among(self.gram, some), z)
 
     def predicted(self, size):
         """(share of the force's variance that so many columns predict in each block, chosen and
@@ -196,6 +194,12 @@ class Sums:
         """(p,) of columns some (p,) that fit the force."""
         gram, score = self.gram.sum(0)[np.ix_(some, some)], self.score.sum(0)[some]
         return _solved(gram[None], score[None, :, None])[0, :, 0]
+
+
+def _among(gram, some):
+    """(b, size, size) of gram (b, k, k): products of columns some (b, size) with each other."""
+    b = np.arange(len(gram))[:, None, None]
+    return gram[b, some[:, :, None], some[:, None]]
 
 
 def _solved(gram, right):

@@ -310,6 +310,11 @@ class World:
             return spec.to_xml(), written
 
 
+def step_of(model, setting):
+    """The time step, s, of a setting {Candidate: values}: the model's own without another."""
+    return next((float(v[0]) for c, v in setting.items() if c.effect.numerical), model.opt.timestep)
+
+
 class Case:
     """One setting, resolved: `on` [(candidate, values)] in the order of the catalogue, without
     those at their nominal values; `off` those that act without a condition; `when` the condition of
@@ -325,8 +330,7 @@ class Case:
         if any(when != conditions[0] for when in conditions):
             raise ValueError("effects under different conditions cannot be simulated together")
         self.when = conditions[0] if conditions else None
-        steps = [v[0] for c, v in self.on if c.effect.numerical]
-        self.step = (steps[0] if steps else model.opt.timestep) / refine
+        self.step = step_of(model, setting) / refine
         self.structure = frozenset(c for c, _ in self.on if c.effect.overrides("build"))
         place = lambda c: c.effect.id(model, c.place.name)
         self.stepwise = bool(self.when) or any(

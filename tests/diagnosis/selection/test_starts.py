@@ -1,13 +1,12 @@
 """Where effects are begun: how large steps are, and which waves the located force chooses."""
 
-from types import SimpleNamespace
-
 import mujoco
 import numpy as np
 import pytest
 from plants import DRIVEN_PENDULUM, recorded
 
 from diagnosis.effects.friction import TURNS
+from diagnosis.estimation.smoother import Trajectory
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.selection.starts import STEP, Starts
 from diagnosis.simulation.simulator import World
@@ -51,7 +50,9 @@ def test_a_friction_map_begins_at_the_wave_of_the_located_force(machine):
     travel = np.ptp(np.quantile(usual.recordings[0].qpos, [0.02, 0.98]))
     force = -np.sign(v) * (0.2 + 0.15 * np.sin(waves * q + 1.0))
     free = np.zeros(len(q), bool)
-    trajectory = SimpleNamespace(qpos=q, qvel=v, force=force, qvel_sd=1e-3 + 0 * v, free=free)
+    sd, run = np.full(q.shape, 1e-3), usual.recordings[0]
+    transition = np.tile(np.eye(2), (len(q), 1, 1))
+    trajectory = Trajectory(q, v, force, sd, sd, sd, {run: 0}, free, transition)
     starts = Starts(world, {}, usual, trajectory=trajectory).of([friction])
     begun = {start.base[2] + start.directions[0, 2] for start in starts}
     nearest = TURNS[np.argmin(abs(TURNS / travel - waves))] / travel
