@@ -69,10 +69,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         )
     search = Identification(world, train, say, log)
     found = search.run()
-    looks = [({}, found.first)]
-    if found.fitted.setting:
-        looks.insert(0, (found.fitted.setting, found.trajectory))
-    event = transients.happened(world, train, looks, found.smoother.position_noise)
+    event = transients.happened(world, train, found)
     if event and not plausible(event.candidate, found.usual).inside(np.array(event.values)):
         event = None
     if event:  # what lasts is searched again where it was not disturbed

@@ -9,12 +9,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from diagnosis.effects.base import JOINT_TRANSMISSIONS
 from diagnosis.estimation import prediction_error, windowing
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults
-from diagnosis.unnamed import led
+from diagnosis.unnamed import depends_on, led
 
 SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing
 COLOURED = 3.0  # of its error under white noise, what noise of another kind may reach
@@ -125,9 +124,7 @@ def _finding(world, candidate, outcome, bounds, figure):
         },
         "adequate": not curve and certain(candidate, bounds[candidate]),
         "strains": outcome.strains.get(candidate),
-        "depends_on": [v for v in (candidate.effect.variable, candidate.effect.factor) if v]
-        if curve
-        else depends_on(world.model, candidate),
+        "depends_on": depends_on(world.model, candidate),
         "when": candidate.when,
         "written_as": handed.files.forms[candidate],
         "also_possible": [
@@ -244,19 +241,6 @@ def unit_of(model, channel):
         if channel == name + ":pos" or (channel == name and kind.name == "mjJNT_SLIDE"):
             return "m"
     return "rad"
-
-
-def depends_on(model, candidate):
-    """What a named effect's force varies with, in the contract's words."""
-    variable, name = candidate.effect.acts_through, candidate.place.name
-    if variable == "velocity" and candidate.place.kind == "actuator":
-        actuator = model.actuator(name)
-        if (
-            actuator.trntype[0] not in JOINT_TRANSMISSIONS
-        ):  # a site or tendon moves with many joints
-            return []
-        name = windowing.joint_name(model, actuator.trnid[0])
-    return [f"{variable}:{name}"] if variable else []
 
 
 def missing_force(world, outcome):

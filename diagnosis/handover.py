@@ -57,12 +57,13 @@ class Files:
 @dataclass(frozen=True)
 class Handed:
     """setting: what was kept; files: its Files; nominal: those of the nominal model; without
-    {Candidate: error of the files without it}."""
+    {Candidate: error of the files without it}; gone: [Candidate] that was not kept."""
 
     setting: dict
     files: Files
     nominal: Files
     without: dict
+    gone: list
 
 
 class Check:
@@ -129,7 +130,7 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
     the errors that are told."""
     nominal = Files.of(world, {})
     before = check.squares(nominal, {}) if setting else None
-    nothing = check.scattered()
+    nothing, gone = check.scattered(), []
     while setting:
         files = Files.of(world, setting)
         after = check.squares(files, setting)
@@ -143,10 +144,11 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
         worst = max(worse, key=worse.get, default=None)
         if worst is None or max(worse[worst], _worse(after, before)) < nothing:
             errors = {out: (told or check).error(without) for out, without in less.items()}
-            return Handed(setting, files, nominal, errors)
+            return Handed(setting, files, nominal, errors, gone)
         log(f"  not handed over: {worst}: worse by {worse[worst]:.4g}, noise {nothing:.4g}")
+        gone.append(worst)
         setting = refit(rest[worst], worst)
-    return Handed(setting, nominal, nominal, {})
+    return Handed(setting, nominal, nominal, {}, gone)
 
 
 def _worse(squares, others):

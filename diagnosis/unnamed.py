@@ -9,7 +9,9 @@ A name stands first only where the error of its joint goes with it. Where much o
 
 import numpy as np
 
-from diagnosis.effects.base import HINGE, SLIDE
+from diagnosis.effects.base import HINGE, JOINT_TRANSMISSIONS, SLIDE
+from diagnosis.effects.unmodelled import Unknown
+from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND, PRICE
 from diagnosis.selection.plausibility import at_limit, plausible
 
@@ -66,9 +68,25 @@ def missing_most(world, outcome):
     return _standing_out(world, outcome, joints)
 
 
-def unknown(joint, outcome):
-    """The finding of a force at a joint, without a name and without a curve."""
-    on = next((d.variables for d in outcome.dependences if d.joint == joint), ())
+def depends_on(model, candidate):
+    """What an effect's force varies with, in the contract's words."""
+    if isinstance(candidate.effect, Unknown):
+        return [v for v in (candidate.effect.variable, candidate.effect.factor) if v]
+    variable, name = candidate.effect.acts_through, candidate.place.name
+    if variable == "velocity" and candidate.place.kind == "actuator":
+        actuator = model.actuator(name)
+        if (
+            actuator.trntype[0] not in JOINT_TRANSMISSIONS
+        ):  # a site or tendon moves with many joints
+            return []
+        name = windowing.joint_name(model, actuator.trnid[0])
+    return [f"{variable}:{name}"] if variable else []
+
+
+def unknown(joint, outcome, on=()):
+    """The finding of a force at a joint, without a name and without a curve, that depends on some
+    variables and on what the force follows best that is left there."""
+    told = next((d.variables for d in outcome.left if d.joint == joint), ())
     return {
         "effect": "unknown",
         "place": {"kind": "joint", "name": joint},
@@ -76,7 +94,7 @@ def unknown(joint, outcome):
         "evidence": {"held_out_error_removed": 0.0, "p_value": None},
         "adequate": False,
         "strains": None,
-        "depends_on": list(on),
+        "depends_on": list(dict.fromkeys((*on, *told)))[:MOST],
         "when": None,
         "written_as": "none",
         "also_possible": [],
@@ -113,6 +131,19 @@ def _at_edge(outcome, candidate):
     return at_limit(candidate, values, plausible(candidate, outcome.found.usual))
 
 
+def _unearned(world, outcome, shares, something):
+    """(joint or None, variables) where a force is missing that no finding tells of: that of what
+    the search found and kept-back recordings spoke against, or the one that stands out most. A
+    curve that was only tried beside it is not even earned."""
+    found = outcome.found.fitted.setting
+    for candidate in outcome.handed.gone:
+        earned = candidate in found or not isinstance(candidate.effect, Unknown)
+        joint = earned and main_joint(world, outcome, candidate, shares)[0]
+        if joint:
+            return joint, depends_on(world.model, candidate)
+    return (missing_most(world, outcome) if something else None), ()
+
+
 def led(world, outcome, findings, something):
     """Findings with `unknown` in the place of names that leave much of the error of their joint or
     have a value at the edge of what was tried, or where something is missing and nothing has a
@@ -139,7 +170,10 @@ def led(world, outcome, findings, something):
             order.append(finding)
         elif joint not in order:
             order.append(joint)
-    joint = missing_most(world, outcome) if something and not order else None
-    order += [joint] if joint else []
-    force = lambda joint: beside(leads.get(joint) or unknown(joint, outcome), names.get(joint, []))
+    on = ()
+    if not order:
+        joint, on = _unearned(world, outcome, shares, something)
+        order += [joint] if joint else []
+    told = lambda joint: leads.get(joint) or unknown(joint, outcome, on)
+    force = lambda joint: beside(told(joint), names.get(joint, []))
     return [force(each) if isinstance(each, str) else each for each in order]

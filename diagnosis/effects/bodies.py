@@ -243,9 +243,13 @@ class ExternalForce(Effect):
 
 @catalogue
 class PayloadChange(Mass):
-    """Another mass of a body for part of the time, kg; the inertia scales along."""
+    """Another mass of a body for part of the time, kg. What is picked up is small beside the body,
+    so the inertia about the centre of mass stays as it is."""
 
     name, timed, simplicity = "payload_change", True, 3
+
+    def edit(self, model, i, values):
+        model.body_mass[i] = values[0]
 
 
 class SensorEffect(Effect):

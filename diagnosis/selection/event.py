@@ -197,15 +197,18 @@ class Local:
         half[look.which] = t_ppf(0.975, freedom) * error[:k] * look.steps
         return chi2, half
 
-    def lasting(self, gain, curves):
-        """Whether a force that acts whenever the motion is like that gains half as much, and is
-        predicted as far where it was not fitted."""
-        scene, setting = self.scene, self.scene.setting
-        plain = scene.left([setting])[0]
-        for curve in curves:
-            if "time" in curve.variables or curve.share < LASTING:
-                continue
-            column = plain - scene.left([{**setting, curve.candidate: curve.values}])[0]
+    def lasting(self, gain, curves, setting=None):
+        """Whether what acts whenever the motion is like that gains half as much: a force that is
+        predicted as far where it was not fitted, or another setting."""
+        scene = self.scene
+        every = [
+            {**scene.setting, curve.candidate: curve.values}
+            for curve in curves
+            if "time" not in curve.variables and curve.share >= LASTING
+        ]
+        plain = scene.left([scene.setting])[0]
+        for other in every + ([setting] if setting else []):
+            column = plain - scene.left([other])[0]
             if (column * plain).sum() ** 2 > LASTING * gain * max((column**2).sum(), 1e-300):
                 return True
         return False

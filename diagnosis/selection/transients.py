@@ -24,22 +24,26 @@ LEVEL = 1e-3  # false-alarm rate, shared between all intervals and effects
 MOST = 400  # windows that are looked at, those about the largest located force
 CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the event must explain
 ALONE = 0.9  # of an event's gain, the share of one window, above which that window is odd
-LONGEST = 0.6  # of a recording: what lasts longer is no event
+LONGEST = 0.6  # of all recordings: what lasts longer is no event
 TRIES = 50  # intervals that are looked at closer
 UNSEEN = 1e-8  # squared size, in noises, of a step that shows nowhere
 
 
-def happened(world, recordings, looks, noise):
-    """The Event that leaves least, of those under several (setting, trajectory), or None."""
-    found = [find(world, recordings, setting, trajectory, noise) for setting, trajectory in looks]
-    return min((e for e in found if e), key=lambda e: e.left, default=None)
+def happened(world, recordings, found):
+    """The Event that leaves least, beside what an identification.Found holds or in its place, or
+    None."""
+    noise, setting = found.smoother.position_noise, found.fitted.setting
+    events = [find(world, recordings, setting, found.trajectory, noise)]
+    if setting:
+        events.append(find(world, recordings, {}, found.first, noise, setting))
+    return min((e for e in events if e), key=lambda e: e.left, default=None)
 
 
-def find(world, recordings, setting, trajectory, noise):
+def find(world, recordings, setting, trajectory, noise, lasting=None):
     """The Event that explains most of a residual which is concentrated in its time, or None.
 
     trajectory: a smoother.Trajectory under the setting {Candidate: values}; noise (nv,): of the
-    positions.
+    positions; lasting: a setting that may explain it as well.
     """
     windows = [w for r in recordings for w in windowing.consecutive(r, SPAN, r.start)]
     number = len(windows)
@@ -60,12 +64,17 @@ def find(world, recordings, setting, trajectory, noise):
     p = f_sf(gain / k / spread, k, max(number - k, 1)) * number**2 * len(looks)
     ceiling = usual + 4 * (usual - np.quantile(each, 0.16))  # of windows without an event
     excess = ((each - ceiling).clip(0) * scene.rows).sum()
-    if p > LEVEL or gain < CONCENTRATED * excess or not _worth(look, scene, chi2, a, gain):
+    inside = ((each - ceiling).clip(0) * scene.rows)[a : b + 1].sum()
+    if p > LEVEL or inside < CONCENTRATED * excess or not _worth(look, scene, chi2, a, gain):
         return None
     local = Local(scene, trajectory, chi2, a, b)
-    if local.lasting(gain, dependences(world, trajectory, recordings, most=None)):
+    curves = dependences(world, trajectory, recordings, most=None)
+    if local.lasting(gain, curves, lasting):
         return None
     event = local.event(look, min(float(p), 1.0))
+    after = scene.left([{**setting, event.candidate: event.values}])[0]
+    if chi2.sum() - (after**2).sum() < CONCENTRATED * excess:
+        return None
     return replace(event, others=local.others(event, looks, look, gain))
 
 
@@ -88,25 +97,21 @@ def _looks(scene):
     """The Looks of every effect that may come and go: pushes, and changes of a mass."""
     world, setting, out = scene.world, scene.setting, []
     by = {(c.effect.name, c.place): c for c in world.candidates}
-    pairs = [(c, c) for c in world.candidates if c.effect.name == "external_force"]
-    pairs += [
-        (by["mass", c.place], c)
-        for c in world.candidates
-        if c.effect.timed and ("mass", c.place) in by
-    ]
     plain = scene.left([setting])[0]
-    for steady, timed in pairs:
-        base = np.array(
-            setting.get(steady, steady.nominal), float
-        )  # what a fit holds of it already
-        steps = np.array([p.step for p in steady.parameters])
-        moved = scene.left([{**setting, steady: tuple(row)} for row in base + np.diag(steps)])
+    for timed in world.candidates:
+        name = {"external_force": "external_force", "payload_change": "mass"}.get(timed.effect.name)
+        if (name, timed.place) not in by:
+            continue
+        # a push adds to one that lasts, a load takes the mass's place
+        lasting = by[name, timed.place]
+        base = np.array(setting.get(lasting, lasting.nominal), float)
+        steps = np.array([p.step for p in timed.parameters])
+        moved = scene.left([{**setting, timed: tuple(row)} for row in base + np.diag(steps)])
         columns = np.moveaxis(plain - moved, 0, -1)
         which = np.flatnonzero((columns**2).sum((0, 1)) > UNSEEN)
         if which.size:
             columns = columns[..., which]
-            # a push adds to one that lasts, a load takes the mass's place
-            start = np.array(timed.nominal, float) if steady is timed else base
+            start = np.array(timed.nominal, float) if lasting is timed else base
             score = np.einsum("wrk,wr->wk", columns, plain)
             gram = np.einsum("wrk,wrl->wkl", columns, columns)
             out.append(Look(timed, start, steps[which], which, score, gram))
@@ -123,9 +128,9 @@ def _interval(look, windows, usual):
     alone = (solved(look.gram, look.score) * look.score).sum(-1)
     spread = max(usual, np.quantile(alone, 0.3) / chi2_ppf(0.3, k))
     owner = [w.recording for w in windows]
+    most = max(1, int(LONGEST * len(windows)))
     for r in dict.fromkeys(owner):
         mine = np.flatnonzero([o is r for o in owner])
-        most = max(1, int(LONGEST * len(mine)))
         for a in mine:
             score = np.cumsum(look.score[a : min(a + most, mine[-1] + 1)], 0)
             gram = np.cumsum(look.gram[a : a + len(score)], 0)

@@ -27,7 +27,7 @@ def test_a_finding_that_predicts_worse_is_not_handed_over(kept_back):
         world.candidate(*c) for c in (("viscous_damping", "pivot"), ("stiffness", "pivot"))
     )
     handed = accepted(world, check, {damping: (0.1,), spring: (0.5,)})
-    assert set(handed.setting) == {damping}
+    assert set(handed.setting) == {damping} and handed.gone == [spring]
     assert handed.without[damping] == pytest.approx(check.error(Files.of(world, {})))
     assert check.error(handed.files) < handed.without[damping]
 

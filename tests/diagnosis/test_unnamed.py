@@ -34,9 +34,10 @@ def smoothed(elbow, shoulder=0.0, scatter=0.1):
     return Trajectory(none, none, force, none, none, sd, {}, free, none)
 
 
-def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)):
+def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1), gone=()):
     """errors: of the elbow, before and after, in ten noises; the shoulder errs by none. room: nats
-    that a perfect model would remove in the shoulder and in the elbow."""
+    that a perfect model would remove in the shoulder and in the elbow. gone: what was not handed
+    over."""
     dependences = [SimpleNamespace(joint=j, variables=v) for j, v in depends]
     before, after = (np.array([[1.0, 1.0, 100 * e**2, 100 * e**2]]) for e in errors)
     evidence = SimpleNamespace(
@@ -51,8 +52,10 @@ def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)
     setting = {FRICTION: (friction,), STIFFNESS: (0.1,), MASS: (0.3,)}
     columns = SimpleNamespace(ahead=ahead)
     fitted = SimpleNamespace(evidence=evidence, columns=columns, setting=setting)
-    found = SimpleNamespace(first=trajectory, usual=USUAL)
-    return SimpleNamespace(found=found, fitted=fitted, dependences=dependences, left=dependences)
+    found = SimpleNamespace(first=trajectory, usual=USUAL, fitted=fitted)
+    return SimpleNamespace(
+        found=found, fitted=fitted, left=dependences, handed=SimpleNamespace(gone=list(gone))
+    )
 
 
 def finding(candidate, removed=0.4, p=1e-5, written="mjcf"):
@@ -149,6 +152,21 @@ def test_a_force_without_a_name_is_told_only_where_a_perfect_model_is_worth_its_
     assert places((0.9 * price, 0.9 * price)) == []
     assert places((1.1 * price, 1.1 * price)) == ["shoulder"]  # what stands out most
     assert places((0.9 * price, 1.1 * price)) == ["elbow"]
+
+
+def test_what_kept_back_recordings_spoke_against_is_an_unknown_force_at_its_joint():
+    loud = smoothed(0.3, shoulder=0.9)
+    elsewhere = [d for d in DEPENDS if d[0] == "shoulder"]
+    given = outcome(loud, depends=elsewhere, gone=[FRICTION])
+    [only] = unnamed.led(WORLD, given, [], False)
+    assert (only["effect"], only["place"]["name"]) == ("unknown", "elbow")
+    assert only["depends_on"] == ["velocity:elbow"] and not only["adequate"]
+    [only] = unnamed.led(WORLD, outcome(loud, depends=DEPENDS, gone=[FRICTION]), [], False)
+    assert only["depends_on"] == ["velocity:elbow", "position:elbow"]  # what it leaves as well
+    kept = unnamed.led(WORLD, outcome(loud, (1.0, 0.1), gone=[FRICTION]), [finding(MASS)], False)
+    assert [f["effect"] for f in kept] == ["mass"]
+    curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))  # tried, and never earned
+    assert unnamed.led(WORLD, outcome(loud, gone=[curve]), [], False) == []
 
 
 def test_what_lies_within_the_noise_says_nothing_against_a_name():
