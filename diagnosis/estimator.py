@@ -79,7 +79,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     say(0.75, "what could stand in a finding's place")
     fitted, others = _classes(search, found, found.fitted, log, search.candidates)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
-        fitted = search.pruned(found.judge, fitted)
+        fitted = search.pruned(found.judge, fitted, found.judge.fit({}))
     fitted = changing(found.judge, fitted)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
@@ -106,7 +106,7 @@ def _checked(search, found, fitted, others, log):
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
         size = _force(found, trajectory, world, rest.joint)
         if not mine or rest.size > INSTEAD * size:
-            fitted = search.pruned(judge, beside) if mine else beside
+            fitted = search.pruned(judge, beside, judge.fit({})) if mine else beside
         if rest.candidate in fitted.setting:
             break
     return Outcome(found, fitted, trajectory, others, {}, {}, left, dependences)
@@ -167,7 +167,9 @@ def _hand_over(search, held, kept_back, outcome, log):
     def refit(some, out):  # what made up for a finding that goes may be another then
         pool[:] = [c for c in pool if c is not out]
         fitted, outcome.others = _classes(search, found, judge.fit(some, steps=3), log, pool)
-        return fitted.setting
+        nothing = judge.fit({})
+        fitted = search.pruned(judge, fitted, nothing)  # and what was earned beside it, not alone
+        return fitted.setting if search.earned(nothing, fitted) else {}
 
     outcome.handed = accepted(world, decides, setting, refit, log, told=check)
     kept = outcome.handed.setting

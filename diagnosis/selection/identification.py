@@ -126,7 +126,7 @@ class Identification:
                 judged.append(judge.fit(fitted.inside, steps=3))
         best = self._choose(judged, now)
         if best is not now:
-            best = self.pruned(judge, self.finer(judge, self.further(judge, best)))
+            best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         better = best.setting.keys() != setting.keys()
         return best, better, [] if setting else self._ranking(beam, start, nodes)
@@ -202,14 +202,16 @@ class Identification:
         each."""
         return step.p_value < LEVEL / (len(self.candidates) + CURVES) / 2
 
-    def pruned(self, judge, fitted):
-        """Without the effects that do not earn their place beside the others. Those that small
-        changes show to do so are not tried without."""
+    def pruned(self, judge, fitted, now):
+        """Without the effects that do not earn their place beside the others, as long as what stays
+        is earned over what there was: together effects may be earned of which none is. Those that
+        small changes show to be needed are not tried without."""
         while len(fitted.setting) > 1:
             tries = [
                 judge.fit({c: v for c, v in fitted.setting.items() if c is not out}, steps=3)
                 for out in self._missed_least(fitted)
             ]
+            tries = [f for f in tries if self.earned(now, f)]
             less = min(tries, key=lambda f: f.loss, default=None)
             if less:
                 step = paired(less.score, fitted.score)

@@ -79,7 +79,25 @@ def test_an_effect_of_a_set_is_one_of_many_that_were_looked_at(search, share, ke
     less.loss = less.score.loss + PRICE * identification.complexity(less.setting)
     monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[:1])
     judge = SimpleNamespace(fit=lambda setting, steps: less)
-    assert search.pruned(judge, both) is (both if kept else less)
+    now = fitted(search, [], 2.0)
+    assert search.pruned(judge, both, now) is (both if kept else less)
+
+
+def test_what_is_earned_only_together_stays(search, monkeypatch):
+    """Neither effect is earned beside the other, and neither is over what there was."""
+    now = fitted(search, [], 0.0)
+    both = fitted(search, ["coulomb_friction", "viscous_damping"], -0.5)
+    alone = fitted(search, ["coulomb_friction"], -0.3)
+    odd = np.where(np.arange(16) % 2, 0.9, -0.9)
+    both.score = Score(both.score.loss, both.score.groups + odd / 100, np.zeros(16), ())
+    noisy = alone.score.groups + odd
+    alone.score = Score(alone.score.loss, noisy, np.zeros(16), ())
+    monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[:1])
+    judge = SimpleNamespace(fit=lambda setting, steps: alone)
+    assert search.earned(now, both)
+    assert not search.earned(alone, both) and not search.earned(now, alone)
+    assert search.pruned(judge, both, now) is both
+    assert search.pruned(judge, both, fitted(search, [], 9.0)) is alone
 
 
 @pytest.mark.parametrize(
