@@ -123,7 +123,7 @@ def above(arm, other):
 
     def values(data):
         (ours, theirs), _ = data.paired(arm, other)
-        return ours[:, 1:].mean(1) - theirs[:, 1:].mean(1)
+        return ours[:, 1:].mean(1) - theirs[:, 1:].mean(1) if len(ours) else np.empty(0)
 
     return values
 

@@ -157,6 +157,8 @@ def rates(results):
         ("knows what it lacks", "… a confident wrong name",
          rate(unknown, lambda r: r.false and not r.unsure)),
         ("predicts", "held-out error above the nominal model's", rate(results, worse)),
+        ("predicts", "… and above that of the true model",
+         rate(results, lambda r: worse(r) and r.after > WORSE * r.floor)),
         ("predicts", "within 1.1 of the true model's, something hidden", rate(hidden, close)),
         ("costs", "no answer", rate(results, lambda r: r.exit != 0)),
         ("costs", "processor seconds, mean", f"{np.mean([r.cpu_seconds for r in results]):.1f}"),
