@@ -47,10 +47,11 @@ class ValueScore:
 
     @property
     def near(self):
-        """Within 5 % of the truth."""
+        """Within 5 % of the truth, or of the nominal value where the truth is nothing at all."""
         if self.value is None or not math.isfinite(self.value):
             return False
-        return abs(self.value - self.truth) <= TOLERANCE * abs(self.truth)
+        scale = abs(self.truth) or abs(self.nominal or 0.0)
+        return abs(self.value - self.truth) <= TOLERANCE * scale
 
     @property
     def held(self):
