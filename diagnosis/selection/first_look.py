@@ -12,7 +12,7 @@ from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
 
 GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
-MORE, EACH = 2, 12  # looks beside the best of those before, more than joints; candidates of each
+MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; new ones in each
 
 
 def likely(missing, starts):
@@ -40,13 +40,15 @@ def likely(missing, starts):
     return kept + some
 
 
-def _best(gains):
-    """Of {Start: gain}, [[Start, ...]] of the candidates that are kept, best first: of each the
-    best in proportion and the best of its whole values."""
-    best = {}
-    for start in sorted(gains, key=lambda start: -gains[start]):
-        best.setdefault(start.candidate, {}).setdefault(start.whole, start)
-    return [list(each.values()) for each in best.values()][:EACH]
+def _best(gains, kept):
+    """(the best of {Start: gain}, further Starts to be kept beside some): of the best candidates
+    that are not kept yet the best in proportion and the best of its whole values."""
+    order = sorted(gains, key=lambda start: -gains[start])
+    best, known = {}, {start.candidate for start in kept}
+    for start in order:
+        if start.candidate not in known:
+            best.setdefault(start.candidate, {}).setdefault(start.whole, start)
+    return order[0], [start for each in list(best.values())[:EACH] for start in each.values()]
 
 
 def _by_rows(target, bases, rounds):
@@ -54,9 +56,10 @@ def _by_rows(target, bases, rounds):
     kept, target = {}, target.ravel()
     bases = {start: basis.reshape(len(target), -1) for start, basis in bases.items()}
     for _ in range(rounds if bases else 0):
-        best = _best({start: explained(basis, target) for start, basis in bases.items()})
-        kept |= dict.fromkeys(sum(best, []))
-        beside = np.linalg.qr(bases[best[0][0]])[0]
+        gains = {start: explained(basis, target) for start, basis in bases.items()}
+        best, further = _best(gains, kept)
+        kept |= dict.fromkeys(further)
+        beside = np.linalg.qr(bases[best])[0]
         rest = lambda x: x - beside @ (beside.T @ x)
         target, bases = rest(target), {start: rest(basis) for start, basis in bases.items()}
     return list(kept)
@@ -68,11 +71,12 @@ def _by_windows(short, setting, inside, starts, rounds):
     beam = Beam(columns, columns.evidence())
     node, kept = beam.node(beam.kept), {}
     for _ in range(rounds):
-        best = _best({columns.begun[k]: gain for k, gain in beam.gains(node).items()})
-        if not best:
+        gains = {columns.begun[k]: gain for k, gain in beam.gains(node).items()}
+        if not gains:
             break
-        kept |= dict.fromkeys(sum(best, []))
-        node = beam.node((*node.options, columns.begun.index(best[0][0])))
+        best, further = _best(gains, kept)
+        kept |= dict.fromkeys(further)
+        node = beam.node((*node.options, columns.begun.index(best)))
     return list(kept)
 
 

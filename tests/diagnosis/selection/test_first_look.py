@@ -54,7 +54,14 @@ def test_what_is_missing_is_kept_first(scene, monkeypatch):
     monkeypatch.setattr(first_look, "MORE", 0)
     some = starts(scene, "coulomb_friction", "armature", "mass")
     assert kept_of(scene, some) == {"coulomb_friction"}
+    # another look keeps others
+    monkeypatch.setattr(first_look, "EACH", 2)
+    monkeypatch.setattr(first_look, "MORE", 1)
+    alike = "coulomb_friction", "viscous_damping", "quadratic_damping", "armature"
+    assert kept_of(scene, starts(scene, *alike)) == set(alike)
     # what the model has already stays
+    monkeypatch.setattr(first_look, "EACH", 1)
+    monkeypatch.setattr(first_look, "MORE", 0)
     friction = {scene[0].candidate("coulomb_friction", "pivot"): (0.1,)}
     assert len(kept_of(scene, some, friction)) == 2
 
