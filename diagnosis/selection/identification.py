@@ -24,7 +24,7 @@ from diagnosis.selection.starts import Starts
 from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
-LEVEL = 0.01  # of false additions in all that is looked at
+LEVEL = 0.05  # of false additions in all that is looked at
 CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
 ALONE = 4  # single effects that it judges beside them
