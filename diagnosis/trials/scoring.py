@@ -47,11 +47,10 @@ class ValueScore:
 
     @property
     def near(self):
-        """Within 5 % of the truth, or of the nominal value where the truth is nothing at all."""
+        """Within 5 % of the truth."""
         if self.value is None or not math.isfinite(self.value):
             return False
-        scale = abs(self.truth) or abs(self.nominal or 0.0)
-        return abs(self.value - self.truth) <= TOLERANCE * scale
+        return abs(self.value - self.truth) <= TOLERANCE * abs(self.truth)
 
     @property
     def held(self):
