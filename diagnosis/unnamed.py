@@ -137,8 +137,9 @@ def _unearned(world, outcome, shares, something):
     curve that was only tried beside it is not even earned."""
     found = outcome.found.fitted.setting
     for candidate in outcome.handed.gone:
-        earned = candidate in found or not isinstance(candidate.effect, Unknown)
-        joint = earned and main_joint(world, outcome, candidate, shares)[0]
+        if isinstance(candidate.effect, Unknown) and candidate not in found:
+            continue
+        joint, _ = main_joint(world, outcome, candidate, shares)
         if joint:
             return joint, depends_on(world.model, candidate)
     return (missing_most(world, outcome) if something else None), ()
@@ -170,10 +171,8 @@ def led(world, outcome, findings, something):
             order.append(finding)
         elif joint not in order:
             order.append(joint)
-    on = ()
-    if not order:
-        joint, on = _unearned(world, outcome, shares, something)
-        order += [joint] if joint else []
+    joint, on = (None, ()) if order else _unearned(world, outcome, shares, something)
+    order += [joint] if joint else []
     told = lambda joint: leads.get(joint) or unknown(joint, outcome, on)
     force = lambda joint: beside(told(joint), names.get(joint, []))
     return [force(each) if isinstance(each, str) else each for each in order]

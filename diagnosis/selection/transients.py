@@ -26,6 +26,7 @@ CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the 
 ALONE = 0.9  # of an event's gain, the share of one window, above which that window is odd
 LONGEST = 0.6  # of all recordings: what lasts longer is no event
 TRIES = 50  # intervals that are looked at closer
+STEADY = {"external_force": "external_force", "payload_change": "mass"}  # what comes, what lasts
 UNSEEN = 1e-8  # squared size, in noises, of a step that shows nowhere
 
 
@@ -99,19 +100,19 @@ def _looks(scene):
     by = {(c.effect.name, c.place): c for c in world.candidates}
     plain = scene.left([setting])[0]
     for timed in world.candidates:
-        name = {"external_force": "external_force", "payload_change": "mass"}.get(timed.effect.name)
+        name = STEADY.get(timed.effect.name)
         if (name, timed.place) not in by:
             continue
         # a push adds to one that lasts, a load takes the mass's place
-        lasting = by[name, timed.place]
-        base = np.array(setting.get(lasting, lasting.nominal), float)
+        steady = by[name, timed.place]
+        base = np.array(setting.get(steady, steady.nominal), float)
         steps = np.array([p.step for p in timed.parameters])
         moved = scene.left([{**setting, timed: tuple(row)} for row in base + np.diag(steps)])
         columns = np.moveaxis(plain - moved, 0, -1)
         which = np.flatnonzero((columns**2).sum((0, 1)) > UNSEEN)
         if which.size:
             columns = columns[..., which]
-            start = np.array(timed.nominal, float) if lasting is timed else base
+            start = np.array(timed.nominal, float) if steady is timed else base
             score = np.einsum("wrk,wr->wk", columns, plain)
             gram = np.einsum("wrk,wrl->wkl", columns, columns)
             out.append(Look(timed, start, steps[which], which, score, gram))
