@@ -13,7 +13,7 @@ others' amounts, above that of a reference. What is within the noise under both 
 either: groups count by how far the larger error exceeds it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,25 +22,27 @@ from diagnosis.common.distributions import t_sf
 NOISE = 0.3  # of the noise, that counts as none
 BEYOND = 1.5  # of the noise, from which on an error counts
 ITERATIONS = 4  # of reweighted least squares
-INDEPENDENT = 2.0  # errors as which the rows of a cell count, where a few groups or windows decide
+INDEPENDENT = 2.0  # errors as which the rows of a cell count, at most
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
 
 
 @dataclass(frozen=True)
 class Score:
     """loss: sum over channels of mean log RMS above the reference's; groups (G,): the part of each
-    group, of which that is the mean; nats (G,): their logs summed; amounts (p,): fitted to all."""
+    group, of which that is the mean; logs (G,): its logs summed; amounts (p,): fitted to all;
+    independent: errors of a cell that are; prior: its cost, nats."""
 
     loss: float
     groups: np.ndarray
-    nats: np.ndarray
+    logs: np.ndarray
     amounts: np.ndarray
+    independent: float = INDEPENDENT
+    prior: float = 0.0
 
     def plus(self, prior, number):
         """With the cost of a prior, nats, of so many independent errors."""
-        cost = prior / number
-        nats = self.nats + prior / len(self.nats)
-        return Score(self.loss + cost, self.groups + cost, nats, self.amounts)
+        loss, groups = self.loss + prior / number, self.groups + prior / number
+        return replace(self, loss=loss, groups=groups, prior=self.prior + prior)
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,9 @@ def paired(before, after):
 
     What is predicted better by as much everywhere is told by how little the differences scatter (a
     t-test). What is seen in a few groups alone is told by how much more likely it makes what was
-    left out: by chance a ratio of likelihoods exceeds x in no more than one of x cases. The group
-    that gains most is not counted: one odd window decides nothing.
+    left out: by chance a ratio of likelihoods exceeds x in no more than one of x cases. It counts
+    as many errors as are independent. The group that gains most is not counted: one odd window
+    decides nothing.
     """
     d = before.groups - after.groups
     n, gain = len(d), float(before.loss - after.loss)
@@ -70,8 +73,8 @@ def paired(before, after):
         return Comparison(gain, 1.0)
     spread = np.std(d, ddof=1) / np.sqrt(n)
     alike = t_sf(d.mean() / spread, n - 1) if spread > 0 else 1.0
-    each = before.nats - after.nats
-    nats = INDEPENDENT * (each.sum() - each.max())
+    each = before.logs - after.logs
+    nats = before.independent * (each.sum() - each.max()) + before.prior - after.prior
     return Comparison(gain, float(min(alike, np.exp(-max(nats, 0.0)))))
 
 
@@ -109,6 +112,28 @@ class Evidence:
         self.cells = max(seen / max(self.channels, 1), 1 / groups)  # of a channel in a group
         counting = self._counting(self.reference).sum() / max(seen, 1)
         self.number = self.cells * max(counting, 1.0)
+        self.independent = self._independent(ahead, residual, cells, square)
+
+    def _independent(self, ahead, residual, cells, square):
+        """Independent errors of a cell, INDEPENDENT at most: were those of a window of d
+        dimensions, the squared cosine between two windows' would be 1 / d in the mean. Windows
+        weigh by how many cells count in them."""
+        counting = self.group.T @ self._counting(square)  # (W, cells)
+        scaled = np.zeros(residual.shape)
+        for (dofs, b), share in zip(cells, counting.T):
+            inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
+            part = np.where(inside, residual[..., dofs], 0.0)
+            size = np.sqrt(share / np.maximum((part**2).sum((1, 2)), 1e-300))
+            scaled[..., dofs] += part * size[:, None, None]
+        flat = scaled.reshape(len(scaled), -1)
+        products = flat @ flat.T
+        count, others = np.diag(products), ~np.eye(len(flat), dtype=bool)
+        alike = (products[others] ** 2).sum()
+        if not alike > 0:
+            return INDEPENDENT
+        dimensions = np.outer(count, count)[others].sum() / alike
+        windows = len(flat) / len(self.group)  # that a group's cell holds
+        return min(windows * dimensions * count.sum() / (count**2).sum(), INDEPENDENT)
 
     def _keep(self, rows, shape, width):
         """Keep rows {(window, cell): (n, width + m)}, columns first, and their products with the
@@ -204,13 +229,23 @@ class Evidence:
         """The Score of mean squared errors (G, cells)."""
         each, shares = self._logs(square)
         groups = len(each) * shares.sum(1)
-        return Score(float(groups.mean()), groups, each.sum(1), amounts)
+        return Score(float(groups.mean()), groups, each.sum(1), amounts, self.independent)
 
     def room(self):
         """Nats of the loss (channels,) that a prediction without errors but the noise would remove
         from the reference."""
         _, shares = self._logs(np.minimum(self.noise**2, self.reference))
         return -shares.reshape(len(shares), self.channels, -1).sum((0, 2))
+
+    def different(self):
+        """How many columns are different: the effective number of independent tests, of their
+        correlations' eigenvalues (Galwey 2009, doi:10.1002/gepi.20408)."""
+        weight = self.group.T @ self._weighed(self.reference)
+        x = self.columns[1:] * np.sqrt(weight.ravel()[self.cell])
+        size = np.linalg.norm(x, axis=1)
+        x = x[size > 0] / size[size > 0, None]
+        values = np.maximum(np.linalg.eigvalsh(x @ x.T), 0.0)
+        return np.sqrt(values).sum() ** 2 / max(values.sum(), 1e-300)
 
     def plain(self, columns=(), amounts=np.zeros(0)):
         """Mean log RMS over all groups, counted alike, summed over channels, at amounts (p,) of

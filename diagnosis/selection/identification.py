@@ -6,6 +6,7 @@ found.fitted.setting; found.trajectory
 
 from copy import copy
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen = {}
+        self.seen, self.looked = {}, 1.0  # columns that are different
         self.candidates = [
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
         ]
@@ -109,6 +110,7 @@ class Identification:
         nominal = squares(self.screen, columns.residual if not setting else None)
         columns.secants(columns.evidence(nominal))
         evidence = columns.evidence(nominal)
+        self.looked = max(evidence.different(), 1.0)
         beam = Beam(columns, evidence, missing)
         start, nodes = beam.nodes()
         self.log(
@@ -150,7 +152,9 @@ class Identification:
         for node in nodes:
             if len(chosen) == FINALISTS:
                 break
-            if node.loss >= start.loss and not self.no_chance(paired(start.score, node.score)):
+            more = len(node.options) - len(start.options)
+            chance = not self.no_chance(paired(start.score, node.score), more)
+            if node.loss >= start.loss and chance:
                 continue
             options = beam.columns.options
             added = [options[k].candidate for k in node.options[len(start.options) :]]
@@ -167,14 +171,12 @@ class Identification:
         return chosen + [n for n in list(alone.values())[:ALONE] if n not in chosen]
 
     def _choose(self, judged, now):
-        """The simplest set that is earned over what there was, and the best is not over it."""
-        judged = [f for f in judged if f is now or f.settled]
-        best = min(judged, key=lambda f: f.loss)
-        if best is now or not self.earned(now, best):
-            return now
-        good = [f for f in judged if f is not now and self.earned(now, f)]
+        """Of the sets that are earned over what there was the simplest over which the best of them
+        is not."""
+        good = [f for f in judged if f is not now and f.settled and self.earned(now, f)]
+        best = min(good, key=lambda f: f.loss, default=now)
         good = [f for f in good if f is best or not self.earned(f, best)]
-        return min(good, key=lambda f: (complexity(f.setting), f.loss))
+        return min(good, key=lambda f: (complexity(f.setting), f.loss), default=now)
 
     @staticmethod
     def further(judge, fitted):
@@ -195,12 +197,17 @@ class Identification:
     def earned(self, before, after):
         """Whether a set is worth its complexity, and better by no chance among those looked at: an
         effect of it is one of many too."""
-        return after.loss < before.loss and self.no_chance(paired(before.score, after.score))
+        step, added = (
+            paired(before.score, after.score),
+            after.setting.keys() - before.setting.keys(),
+        )
+        return after.loss < before.loss and self.no_chance(step, len(added))
 
-    def no_chance(self, step):
-        """Whether a Comparison is significant among all candidates and curves, with two tests
-        each."""
-        return step.p_value < LEVEL / (len(self.candidates) + CURVES) / 2
+    def no_chance(self, step, added=1):
+        """Whether a Comparison is significant among all sets of so many different columns, with two
+        tests each."""
+        sets = self.looked**added / factorial(added)
+        return step.p_value < LEVEL / max(sets, self.looked) / 2
 
     def pruned(self, judge, fitted, now):
         """Without the effects that do not earn their place beside the others, as long as what stays
@@ -246,6 +253,7 @@ class Left:
 
     score: Score
     loss: float
+    setting: dict
 
 
 def without(fitted, candidate):
@@ -258,11 +266,11 @@ def without(fitted, candidate):
         if option.candidate is candidate:
             gone = [away[row != 0][0] / row[row != 0][0] for row in option.directions]
             if not np.isfinite(gone).all():
-                return Left(fitted.score, -np.inf)
+                return Left(fitted.score, -np.inf, {})
             low[list(option.columns)] = high[list(option.columns)] = gone
     score = fitted.evidence.score(index, low, high, precision, pull)
-    rest = [c for c in fitted.setting if c is not candidate]
-    return Left(score, score.loss + PRICE * complexity(rest))
+    rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
+    return Left(score, score.loss + PRICE * complexity(rest), rest)
 
 
 def changing(judge, fitted):

@@ -72,6 +72,45 @@ def test_columns_of_noise_are_no_improvement():
     assert np.mean([f.p_value < 0.05 for f in found]) < 0.05 + 2 * np.sqrt(0.05 * 0.95 / 300)
 
 
+def shaped(rng, rank, ahead):
+    """Errors (W, rows, channels) of few shapes that all windows share, of very different sizes."""
+    shapes = rng.normal(size=(rank, *ahead.known.shape[1:])).cumsum(1).cumsum(1)
+    shapes /= np.sqrt((shapes**2).mean(1, keepdims=True))
+    size = np.exp(0.7 * rng.normal(size=(len(ahead.group), 1)))
+    return np.einsum("wk,ktc->wtc", size * rng.normal(size=(len(size), rank)), shapes)
+
+
+@pytest.mark.parametrize("rank, windows", [(1, 1), (4, 1), (30, 1), (1, 2)])
+def test_errors_of_many_joints_that_one_thing_pushes_are_few(rank, windows):
+    """Ten joints in three bands err alike: a column that happens to fit meets one error, not 30."""
+    rng, p = np.random.default_rng(5), []
+    ahead = scene(windows=windows, channels=10, bands=3)
+    for _ in range(200):
+        residual, column = shaped(rng, rank, ahead), shaped(rng, rank, ahead)
+        evidence = evidence_of(ahead, residual, column[..., None])
+        p.append(paired(free(evidence, ()), free(evidence, (0,))).p_value)
+    assert np.mean(np.array(p) < 0.01) < 0.06 and np.mean(np.array(p) < 1e-3) < 0.02
+
+
+def test_errors_of_every_shape_are_as_many_as_cells_hold():
+    ahead = scene(windows=1, channels=10, bands=3)
+    residual = np.random.default_rng(6).normal(size=ahead.known.shape)
+    evidence = evidence_of(ahead, residual, np.zeros((*residual.shape, 0)))
+    assert free(evidence, ()).independent == INDEPENDENT
+    evidence = evidence_of(ahead, 1e-3 * residual, np.zeros((*residual.shape, 0)))
+    assert free(evidence, ()).independent == INDEPENDENT  # within the noise
+
+
+def test_columns_that_say_the_same_are_one():
+    rng, ahead = np.random.default_rng(7), scene(windows=1, rows=60)
+    column, other = rng.normal(size=(2, *ahead.known.shape))
+    different = lambda *each: evidence_of(ahead, column, np.stack(each, -1)).different()
+    assert different(column) == pytest.approx(1.0)
+    assert different(column, -3 * column, column, 0 * column) == pytest.approx(1.0, abs=1e-3)
+    assert different(column, other) == pytest.approx(2.0, abs=0.1)
+    assert 1.1 < different(column, column + 0.5 * other) < 1.9
+
+
 def test_a_known_improvement_is_found_at_its_size():
     rng, ahead = np.random.default_rng(2), scene(channels=2, bands=2)
     for _ in range(20):

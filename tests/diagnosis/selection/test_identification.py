@@ -8,7 +8,7 @@ import pytest
 from arm import ARM
 
 from diagnosis.selection import identification
-from diagnosis.selection.criterion import PRICE, Score
+from diagnosis.selection.criterion import PRICE, Comparison, Score
 from diagnosis.selection.identification import Identification
 from diagnosis.selection.unmodelled_force import Dependence
 from diagnosis.simulation.simulator import World
@@ -18,7 +18,7 @@ from diagnosis.simulation.simulator import World
 def search():
     world = World(mujoco.MjSpec.from_string(ARM))
     found = Identification(world, [])
-    found.trajectory = None
+    found.trajectory, found.looked = None, 40.0
     return found
 
 
@@ -65,6 +65,10 @@ def test_a_set_is_chosen_for_its_worth(search):
     assert search._choose([now, friction, both, bound], now) is friction
     assert search._choose([now, friction, better], now) is better
     assert search._choose([now, little], now) is now  # not worth its price
+    chance = fitted(search, ["armature", "coulomb_friction"], -2.0)
+    odd = np.where(np.arange(16) % 2, 4.0, -4.0)
+    chance.score = Score(chance.score.loss, chance.score.groups + odd, np.zeros(16), ())
+    assert search._choose([now, chance, friction], now) is friction
 
 
 @pytest.mark.parametrize("share, kept", [(1.3, True), (0.8, False)])
@@ -81,6 +85,20 @@ def test_an_effect_of_a_set_is_one_of_many_that_were_looked_at(search, share, ke
     judge = SimpleNamespace(fit=lambda setting, steps: less)
     now = fitted(search, [], 2.0)
     assert search.pruned(judge, both, now) is (both if kept else less)
+
+
+def test_a_set_is_one_of_all_the_sets_that_were_looked_at(search):
+    """Of 40 columns there are 780 pairs."""
+    step = Comparison(1.0, 0.05 / 40 / 20)
+    assert search.no_chance(step) and not search.no_chance(step, 2)
+    groups = 0.53 * np.where(np.arange(16) % 2, 1.0, -1.0)  # p-value 1.2e-3 of a gain of 0.5
+    search.looked = 20.0
+    now = fitted(search, [], 0.0)
+    for names, earned in (["armature"], True), (["armature", "coulomb_friction"], False):
+        after = fitted(search, names, 0.0)
+        after.score = Score(-0.5, groups - 0.5, np.zeros(16), ())
+        after.loss = -0.1
+        assert search.earned(now, after) == earned
 
 
 def test_what_is_earned_only_together_stays(search, monkeypatch):
