@@ -14,6 +14,7 @@ either: groups count by how far the larger error exceeds it.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -93,7 +94,8 @@ class Evidence:
         cells = [(dofs, b) for dofs in ahead.channels for b in bands]
         stack = np.concatenate([residual[..., None], columns, ahead.freedom()], -1)
         self.channels = len(ahead.channels)
-        self.noise, rows = np.zeros(len(cells)), {}
+        self.noise, rows, positions = np.zeros(len(cells)), {}, {}
+        position = np.arange(residual[0].size).reshape(residual[0].shape)
         counted = np.zeros((len(residual), len(cells)))
         for j, (dofs, b) in enumerate(cells):
             inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
@@ -102,37 +104,39 @@ class Evidence:
             counted[:, j] = inside.sum((1, 2))
             for w in np.flatnonzero(counted[:, j]):
                 rows[w, j] = stack[w][:, dofs][inside[w]]
+                positions[w, j] = position[:, dofs][inside[w]]
         self.group = np.arange(groups)[:, None] == ahead.group  # (G, W)
         self.rows, self.count = counted, self.group @ counted
         self.floor = (NOISE * self.noise) ** 2 + 1e-30
         self._keep(rows, counted.shape, columns.shape[-1] + 1)
-        square = self.squares((), np.zeros(0))
-        self.reference = square if reference is None else reference
+        empty = [np.zeros(0, int)]  # of no rows
+        self.position = np.concatenate([positions[k] for k in sorted(positions)] or empty)
+        self.positions = position.size  # of a window: rows by degrees of freedom
+        self.square = self.squares((), np.zeros(0))
+        self.reference = self.square if reference is None else reference
         seen = (self.count > 0).any(0).sum()
         self.cells = max(seen / max(self.channels, 1), 1 / groups)  # of a channel in a group
         counting = self._counting(self.reference).sum() / max(seen, 1)
         self.number = self.cells * max(counting, 1.0)
-        self.independent = self._independent(ahead, residual, cells, square)
 
-    def _independent(self, ahead, residual, cells, square):
+    @cached_property
+    def independent(self):
         """Independent errors of a cell, INDEPENDENT at most: were those of a window of d
         dimensions, the squared cosine between two windows' would be 1 / d in the mean. Windows
         weigh by how many cells count in them."""
-        counting = self.group.T @ self._counting(square)  # (W, cells)
-        scaled = np.zeros(residual.shape)
-        for (dofs, b), share in zip(cells, counting.T):
-            inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
-            part = np.where(inside, residual[..., dofs], 0.0)
-            size = np.sqrt(share / np.maximum((part**2).sum((1, 2)), 1e-300))
-            scaled[..., dofs] += part * size[:, None, None]
-        flat = scaled.reshape(len(scaled), -1)
-        products = flat @ flat.T
-        count, others = np.diag(products), ~np.eye(len(flat), dtype=bool)
+        counting = self.group.T @ self._counting(self.square)  # (W, cells)
+        size = np.sqrt(counting / np.maximum(self._sums(self.columns[0] ** 2), 1e-300))
+        scaled = np.zeros((len(counting), self.positions))
+        scaled[self.cell // self.shape[1], self.position] = (
+            self.columns[0] * size.ravel()[self.cell]
+        )
+        products = scaled @ scaled.T
+        count, others = np.diag(products), ~np.eye(len(products), dtype=bool)
         alike = (products[others] ** 2).sum()
         if not alike > 0:
             return INDEPENDENT
         dimensions = np.outer(count, count)[others].sum() / alike
-        windows = len(flat) / len(self.group)  # that a group's cell holds
+        windows = len(products) / len(self.group)  # that a group's cell holds
         return min(windows * dimensions * count.sum() / (count**2).sum(), INDEPENDENT)
 
     def _keep(self, rows, shape, width):

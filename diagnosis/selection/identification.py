@@ -54,7 +54,8 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen, self.looked = {}, 1.0  # columns that are different
+        self.seen = {}
+        self.looked = 1.0  # how many different columns a round looks at
         self.candidates = [
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
         ]
@@ -197,11 +198,9 @@ class Identification:
     def earned(self, before, after):
         """Whether a set is worth its complexity, and better by no chance among those looked at: an
         effect of it is one of many too."""
-        step, added = (
-            paired(before.score, after.score),
-            after.setting.keys() - before.setting.keys(),
-        )
-        return after.loss < before.loss and self.no_chance(step, len(added))
+        step = paired(before.score, after.score)
+        added = len(after.setting.keys() - before.setting.keys())
+        return after.loss < before.loss and self.no_chance(step, added)
 
     def no_chance(self, step, added=1):
         """Whether a Comparison is significant among all sets of so many different columns, with two
