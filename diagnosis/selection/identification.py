@@ -172,12 +172,13 @@ class Identification:
         return chosen + [n for n in list(alone.values())[:ALONE] if n not in chosen]
 
     def _choose(self, judged, now):
-        """Of the sets that are earned over what there was the simplest over which the best of them
-        is not."""
-        good = [f for f in judged if f is not now and f.settled and self.earned(now, f)]
-        best = min(good, key=lambda f: f.loss, default=now)
+        """The simplest set that is earned over what there was, and the best is not over it."""
+        best = min((f for f in judged if f is now or f.settled), key=lambda f: f.loss)
+        if best is now or not self.earned(now, best):
+            return now
+        good = [f for f in judged if f.settled and f is not now and self.earned(now, f)]
         good = [f for f in good if f is best or not self.earned(f, best)]
-        return min(good, key=lambda f: (complexity(f.setting), f.loss), default=now)
+        return min(good, key=lambda f: (complexity(f.setting), f.loss))
 
     @staticmethod
     def further(judge, fitted):
