@@ -25,6 +25,10 @@ class Chain(Ahead):
     touches or the chain runs away, and effects with states or sensors of their own, are simulated
     as in Ahead."""
 
+    def __init__(self, world, windows, noise):
+        super().__init__(world, windows, noise)
+        self.glances = {}  # the simulations of its beginnings
+
     def start(self, trajectory, setting=None):
         super().start(trajectory, setting)
         self.trajectory, self.map = trajectory, None
@@ -52,10 +56,12 @@ class Chain(Ahead):
         self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
 
     def beginnings(self, number, seconds):
-        """A Chain of the first seconds of so many of the windows, evenly chosen."""
+        """A Chain of the first seconds of so many of the windows, evenly chosen, which simulates an
+        effect once for all starts: a motion that is located anew hardly moves."""
         chosen = [self.windows[i] for i in windowing.evenly(len(self.windows), number)]
         short = Chain(self.world, [windowing.beginning(w, seconds) for w in chosen], self.noise)
         short.start(self.trajectory, self.base)
+        short.beyond = self.glances
         return short
 
     def _begun(self, windows):

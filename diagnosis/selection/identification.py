@@ -35,8 +35,9 @@ TRIED = 2  # effects of a set that may be missed least, tried without
 @dataclass(frozen=True)
 class Found:
     """What the search ended with: fitted, the Fitted set; trajectory and first, smoothed under it
-    and under the nominal model; judge, on the windows begun at that trajectory, and chain, along
-    it; ranking: [(candidate, loss removed alone, p-value)], most first."""
+    and under the nominal model; judge, on the windows begun at that trajectory; missing, the
+    MissingForce of the last round; ranking: [(candidate, loss removed alone, p-value)], most
+    first."""
 
     fitted: Fitted
     trajectory: object
@@ -44,7 +45,7 @@ class Found:
     smoother: Smoother
     usual: Usual
     judge: Judge
-    chain: Chain
+    missing: MissingForce
     ranking: list
 
 
@@ -54,7 +55,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen = {}
+        self.seen, self.missing = {}, None
         self.looked = 1.0  # how many different columns a round looks at
         self.candidates = [
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
@@ -86,7 +87,7 @@ class Identification:
             self.screen.start(trajectory, setting)
             judge = self.judge()
             fitted = judge.fit(setting)
-        return Found(fitted, trajectory, first, smoother, self.usual, judge, self.screen, ranking)
+        return Found(fitted, trajectory, first, smoother, self.usual, judge, self.missing, ranking)
 
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
@@ -104,7 +105,7 @@ class Identification:
         others = [c for c in self.candidates if c not in setting]
         every, curves = [*setting, *others], self._curves(setting)
         starts = Starts(self.world, setting, self.usual, self.seen, self.trajectory)
-        missing = MissingForce(self.screen, setting)
+        self.missing = missing = MissingForce(self.screen, setting, self.missing)
         some = likely(missing, starts.of(every))
         some += [starts.curve(*curve) for curve in curves]
         columns = Columns(self.screen, setting, some, seen=self.seen)

@@ -29,7 +29,9 @@ class MissingForce:
     usual in each dof; noise (nv,): how well that is known; free: all such rows, of which some are
     looked at."""
 
-    def __init__(self, chain, setting):
+    def __init__(self, chain, setting, before=None):
+        """before: a MissingForce in the same rows, from which what effects hold that neither
+        setting has is taken over: a motion that is located anew hardly moves."""
         self.chain, self.setting = chain, setting
         self.plain, nv = chain.plain(setting), chain.model.nv
         trajectory = chain.trajectory
@@ -40,7 +42,11 @@ class MissingForce:
         usable = usable[: len(usable) // GROUPS * GROUPS]
         self.rows, force = self.rows[usable], force[usable]
         self.seen = np.isfinite(chain.noise)
-        self.force, self.added, self.noise = force, {}, np.full(nv, np.inf)
+        self.lacking, self.force, self.noise = force, force, np.full(nv, np.inf)
+        self.added = {}
+        if before and np.array_equal(before.rows, self.rows):
+            known, inside = before.added.items(), {*setting, *before.setting}
+            self.added = {key: held for key, held in known if key[0] not in inside}
         if len(usable):
             size = 1.4826 * np.median(abs(force), 0) + LEAST * rms(force) + 1e-12
             self.weight = np.where(self.seen, 1 / np.maximum(size, abs(force) / ODD), 0.0)
@@ -65,8 +71,8 @@ class MissingForce:
         if self.chain.apart(start.candidate) or not len(self.rows):
             return None
         added = [self._added(s, start.candidate) for s in start.settings(self.plain)]
-        moved = any(a.any() for a in added)
-        return np.stack(added, -1) if moved and np.isfinite(added).all() else None
+        moved = any(a.any() for a in added) and np.isfinite(added).all()
+        return np.stack(added, -1) * self.weight[..., None] if moved else None
 
     def _added(self, plain, candidate):
         """(n, nv): what a candidate of a plain setting holds, worked out once for its values."""
@@ -77,7 +83,7 @@ class MissingForce:
 
     def _held(self, plain):
         """(n, nv): what a plain setting holds beyond that of this force."""
-        return self.force - self._force(plain) * self.weight
+        return self.lacking - self._force(plain)
 
     def evidence(self, starts):
         """The Evidence of the force and of what Starts hold of it, all their directions in turn."""
@@ -95,7 +101,7 @@ class MissingForce:
         """[Score] of the force that settings lack, or None where no row tells."""
         if not len(self.rows):
             return None
-        held = [self._held(self.chain.plain(setting)) for setting in settings]
+        held = [self._held(self.chain.plain(setting)) * self.weight for setting in settings]
         evidence = self._evidence(np.stack([self.force, *held], -1))
         return [evidence.at([k], np.ones(1)) for k in range(len(held))]
 

@@ -1,7 +1,7 @@
 """What could stand in a finding's place: effects whose refits predict as well, told as a class, the
 best for its price first.
 
-fitted, others = classes(candidates, judge, chain, fitted)
+fitted, others = classes(candidates, judge, missing, fitted, begun)
 others[candidate]                                    # [(other, values), ...]
 """
 
@@ -22,16 +22,16 @@ FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
 
 
-def classes(candidates, judge, chain, fitted, begun, log=lambda what: None):
+def classes(candidates, judge, missing, fitted, begun, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
-    its price, and the other members. Among equals the finding stays. begun(setting): a Judge whose
-    windows begin at the motion that is located under a setting. A finer time step is no physics,
-    so nothing is asked for in its place."""
+    its price, and the other members. Among equals the finding stays. missing: a MissingForce along
+    the motion; begun(setting): a Judge whose windows begin at the motion that is located under a
+    setting. A finer time step is no physics, so nothing is asked for in its place."""
     others, swapped = {}, False
     for candidate in list(fitted.setting):
         if candidate not in fitted.setting or candidate.effect.numerical:
             continue
-        members = _members(candidates, judge, chain, fitted, candidate)
+        members = _members(candidates, judge, missing, fitted, candidate)
         units, most = complexity(fitted.setting), fitted.loss - TIED
         better = [m for m in members if m[0].loss < most or complexity(m[0].setting) < units]
         members.append((fitted, candidate))
@@ -43,17 +43,17 @@ def classes(candidates, judge, chain, fitted, begun, log=lambda what: None):
         others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
         told = {o for o, _ in others[own]}
         pool = [c for c in candidates if c not in told and c not in fitted.setting]
-        others[own] += _late(pool, begun, chain, fitted, own)
+        others[own] += _late(pool, begun, missing.chain.world, fitted, own)
     others = {c: each[:MOST] for c, each in others.items() if c in fitted.setting}
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
 
-def _members(candidates, judge, chain, fitted, candidate):
+def _members(candidates, judge, found, fitted, candidate):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
     their price, best first, and against which the missing force does not speak."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting]
-    missing, out = MissingForce(chain, rest), []
+    missing, out = MissingForce(found.chain, rest, found), []
     near = _alike(judge, missing, fitted, candidate, pool)
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
@@ -66,10 +66,9 @@ def _members(candidates, judge, chain, fitted, candidate):
     return sorted(out, key=lambda pair: pair[0].loss)
 
 
-def _late(pool, begun, chain, fitted, candidate):
+def _late(pool, begun, world, fitted, candidate):
     """[(other, values)] of a delay in the drive for one in the sensor, or the other way round, that
     predict as well: either begins at states of its own, for a late sensor shows others."""
-    world = chain.world
     late = lambda c: (
         c.effect.overrides("measure") and c.effect.measure(np.ones(len(c.parameters)))[2] > 0
     )

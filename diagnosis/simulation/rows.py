@@ -16,7 +16,7 @@ from diagnosis.simulation.simulator import Case
 
 INPUT = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 CHUNK = 40000  # simulations in memory at a time
-STEPS, COARSER = 2, 4.0  # coarse ones in a row, no longer than so many of the simulator's
+STEPS = 2  # coarse ones in a row
 SWING = 0.3  # rad of phase, or share of the decay, of the fastest joint's motion in a coarse step
 SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per second, of the force
 
@@ -25,7 +25,7 @@ def coarse(world, recordings):
     """{time_step: seconds}: a few steps in a row, for what is a difference of two simulations."""
     own = world.model.opt.timestep
     seconds = np.median(np.concatenate([np.diff(r.time) for r in recordings])) / STEPS
-    seconds = min(seconds, COARSER * own, SWING / max(_fastest(world.model), 1e-9))
+    seconds = min(seconds, SWING / max(_fastest(world.model), 1e-9))
     # never quite the simulator's own, with which Euler's method would be explicit in drives
     return {world.candidate("time_step", "world"): (float(np.nextafter(max(seconds, own), 0)),)}
 

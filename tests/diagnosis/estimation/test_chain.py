@@ -102,9 +102,8 @@ def test_coarse_steps_invent_nothing_under_the_effects_that_located_the_motion(h
     world, truth, chain = here
     trajectory = Smoother(world, list(chain.trajectory.first)).locate(truth)
     found = []
-    monkeypatch.setattr(rows, "STEPS", 1)  # a row is two of the simulator's own steps
-    for steps in (rows.COARSER, 1.0):
-        monkeypatch.setattr(rows, "COARSER", steps)
+    for steps in (1, 1000):  # a row is two of the simulator's own steps
+        monkeypatch.setattr(rows, "STEPS", steps)
         some = Chain(world, chain.windows, chain.noise)
         some.start(trajectory, truth)
         more = {**truth, world.candidate("gain", "drive"): (1.1,)}

@@ -133,3 +133,14 @@ def test_beginnings_are_the_first_seconds_of_windows(scene):
         if w.first in [s.first for s in short.windows if s.recording is w.recording]
     ]
     np.testing.assert_allclose(gap, whole[index][:, : gap.shape[1]], atol=1e-12)
+
+
+def test_beginnings_simulate_an_effect_once_for_all_starts(scene, monkeypatch):
+    world, chain, _ = scene
+    late = {world.candidate("sensor_delay", "pivot"): (0.01,)}
+    nominal, first = chain.beginnings(4, 0.3).residual([{}, late])
+    chain.start(chain.trajectory)
+    short, asked = chain.beginnings(4, 0.3), []
+    monkeypatch.setattr(short.whole, "residual", asked.append)
+    np.testing.assert_array_equal(short.residual([late])[0] - nominal, first - nominal)
+    assert not asked

@@ -13,6 +13,7 @@ from diagnosis.recordings.recording import Recording
 from diagnosis.selection import rivals
 from diagnosis.selection.criterion import Score, paired
 from diagnosis.selection.judge import Judge
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.simulator import World
 
@@ -99,9 +100,10 @@ def test_back_emf_and_viscous_damping_are_one_class():
     )
     names = "viscous_damping", "back_emf", "coulomb_friction", "gain", "stiffness"
     pool = [c for c in world.candidates if c.effect.name in names]
+    missing = MissingForce(along(judge), {})
     for found in (damping, back_emf):
         fitted = judge.fit({found: (0.1,)})
-        again, others = rivals.classes(pool, judge, along(judge), fitted, lambda setting: judge)
+        again, others = rivals.classes(pool, judge, missing, fitted, lambda setting: judge)
         [named] = again.setting
         told = {named, *(c for c, _ in others[named])}
         assert {damping, back_emf} <= told
@@ -118,7 +120,8 @@ def test_what_is_no_equal_is_not_told():
     fitted = judge.fit({friction: (0.05,)})
     others = "gain", "stiffness", "mass", "delay", "viscous_damping", "gravity", "bias"
     pool = [c for c in world.candidates if c.effect.name in others]
-    again, told = rivals.classes(pool, judge, along(judge), fitted, lambda setting: judge)
+    missing = MissingForce(along(judge), {})
+    again, told = rivals.classes(pool, judge, missing, fitted, lambda setting: judge)
     assert list(again.setting) == [friction]
     assert told[friction] == []
 
@@ -205,7 +208,7 @@ def test_a_late_sensor_is_told_beside_a_late_drive():
         )
 
     begun = lambda setting: SimpleNamespace(fit=fit) if late in setting else None
-    some = world.candidates, begun, SimpleNamespace(world=world)
+    some = world.candidates, begun, world
     losses = {delay: -1.0, late: -0.95}
     fitted = fit({delay: (0.01,)})
     assert rivals._late(*some, fitted, delay) == [(late, (0.01,))]

@@ -83,3 +83,21 @@ def test_without_rows_nothing_is_told(touching):
     assert not len(missing.rows) and missing.basis(start) is None and missing.scores({}) is None
     columns = Columns(chain, {}, [start])
     assert Beam(columns, columns.evidence(), missing).nodes()
+
+
+def test_what_an_effect_holds_is_worked_out_once_unless_a_setting_has_it(monkeypatch):
+    world, chain, usual = located(0.0)
+    friction, mass = world.candidate("coulomb_friction", "pivot"), world.candidate("mass", "arm")
+    setting = {friction: (FRICTION,)}
+    of_both = Starts(world, setting, usual).of([friction, mass])
+    before = MissingForce(chain, {})
+    for start in Starts(world, {}, usual).of([friction, mass]):
+        before.basis(start)
+    anew, asked = MissingForce(chain, setting), []
+    carried = MissingForce(chain, setting, before)
+    monkeypatch.setattr(carried, "_held", lambda plain: asked.append(plain) or anew._held(plain))
+    for start in of_both:
+        x, y = carried.basis(start), anew.basis(start)
+        assert np.median(abs(x - y)) < 0.02 * np.median(abs(y))  # but where friction sticks
+    values = {plain[mass] for plain in asked if mass in plain}
+    assert asked and not values

@@ -39,11 +39,11 @@ def chosen(monkeypatch, fitted, losses):
 
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
-    silent = SimpleNamespace(scores=lambda *settings: None)
+    silent = SimpleNamespace(scores=lambda *settings: None, chain=SimpleNamespace(world=None))
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
     monkeypatch.setattr(rivals, "_late", lambda *args: [])
     start = Judge().fit({names[fitted]: (2.0,)})
-    found, told = rivals.classes([DRY, CURVED], Judge(), None, start, None)
+    found, told = rivals.classes([DRY, CURVED], Judge(), silent, start, None)
     return [c.name for c in found.setting], {
         c.name: [o.name for o, _ in each] for c, each in told.items()
     }
