@@ -3,7 +3,7 @@ motion.
 
 starts = likely(missing, starts)        # those that are worth a column in every window
 
-It takes a tenth of the time of such columns.
+What it works out holds for all rounds; columns are those of one.
 """
 
 import numpy as np
