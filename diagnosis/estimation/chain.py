@@ -27,7 +27,7 @@ class Chain(Ahead):
 
     def __init__(self, world, windows, noise):
         super().__init__(world, windows, noise)
-        self.glances = {}  # the simulations of its beginnings
+        self.glances = {}  # {(number, seconds): what effects do in such beginnings}
 
     def start(self, trajectory, setting=None):
         super().start(trajectory, setting)
@@ -61,7 +61,7 @@ class Chain(Ahead):
         chosen = [self.windows[i] for i in windowing.evenly(len(self.windows), number)]
         short = Chain(self.world, [windowing.beginning(w, seconds) for w in chosen], self.noise)
         short.start(self.trajectory, self.base)
-        short.beyond = self.glances
+        short.beyond = self.glances.setdefault((number, seconds), {})
         return short
 
     def _begun(self, windows):

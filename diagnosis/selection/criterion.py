@@ -111,7 +111,7 @@ class Evidence:
         self._keep(rows, counted.shape, columns.shape[-1] + 1)
         empty = [np.zeros(0, int)]  # of no rows
         self.position = np.concatenate([positions[k] for k in sorted(positions)] or empty)
-        self.positions = position.size  # of a window: rows by degrees of freedom
+        self.window_size = position.size  # rows by degrees of freedom
         self.square = self.squares((), np.zeros(0))
         self.reference = self.square if reference is None else reference
         seen = (self.count > 0).any(0).sum()
@@ -126,7 +126,7 @@ class Evidence:
         weigh by how many cells count in them."""
         counting = self.group.T @ self._counting(self.square)  # (W, cells)
         size = np.sqrt(counting / np.maximum(self._sums(self.columns[0] ** 2), 1e-300))
-        scaled = np.zeros((len(counting), self.positions))
+        scaled = np.zeros((len(counting), self.window_size))
         scaled[self.cell // self.shape[1], self.position] = (
             self.columns[0] * size.ravel()[self.cell]
         )

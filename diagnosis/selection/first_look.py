@@ -3,7 +3,8 @@ motion.
 
 starts = likely(missing, starts)        # those that are worth a column in every window
 
-What it works out holds for all rounds; columns are those of one.
+What effects do in that part is worked out once for all rounds, where nothing touches. Columns are
+simulated anew in each round.
 """
 
 import numpy as np

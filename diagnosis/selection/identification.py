@@ -173,7 +173,8 @@ class Identification:
         return chosen + [n for n in list(alone.values())[:ALONE] if n not in chosen]
 
     def _choose(self, judged, now):
-        """The simplest set that is earned over what there was, and the best is not over it."""
+        """The simplest set that is earned over what there was and over which the best set is not
+        earned. Where the best is not earned over what there was, that stays."""
         best = min((f for f in judged if f is now or f.settled), key=lambda f: f.loss)
         if best is now or not self.earned(now, best):
             return now

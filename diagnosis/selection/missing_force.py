@@ -25,9 +25,9 @@ LEAST = 0.05  # of its RMS, that its usual size is taken to be
 
 
 class MissingForce:
-    """In rows of a Chain where nothing touches, under a setting. force (n, nv), in units of what is
-    usual in each dof; noise (nv,): how well that is known; free: all such rows, of which some are
-    looked at."""
+    """In rows of a Chain where nothing touches, under a setting. lacking (n, nv), N m or N; force
+    (n, nv), the same in units of what is usual in each dof; noise (nv,): how well that is known;
+    free: all such rows, of which some are looked at."""
 
     def __init__(self, chain, setting, before=None):
         """before: a MissingForce in the same rows, from which what effects hold that neither

@@ -48,12 +48,12 @@ def classes(candidates, judge, missing, fitted, begun, log=lambda what: None):
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
 
-def _members(candidates, judge, found, fitted, candidate):
+def _members(candidates, judge, before, fitted, candidate):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
     their price, best first, and against which the missing force does not speak."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting]
-    missing, out = MissingForce(found.chain, rest, found), []
+    missing, out = MissingForce(before.chain, rest, before), []
     near = _alike(judge, missing, fitted, candidate, pool)
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
