@@ -116,7 +116,7 @@ class ServoStiffness(ServoGain):
     """kp in force = kp (u − q) − kv q̇, in N·m/rad or N/m of the actuator's length; kv stays.
     Source: MuJoCo's <position>."""
 
-    name, related = "servo_stiffness", ("gain", "servo_damping", "stiffness")
+    name = "servo_stiffness"
 
     def parameters(self, model, i):
         kp, unit = (
@@ -148,7 +148,7 @@ class ServoDamping(ServoGain):
     limited force): a class. Of a <velocity> servo, the same as `gain`.
     """
 
-    name, related = "servo_damping", ("gain", "servo_stiffness", "viscous_damping", "back_emf")
+    name = "servo_damping"
     acts_through = "velocity"
 
     def parameters(self, model, i):
@@ -183,7 +183,7 @@ class Gain(ActuatorEffect):
     Source: MuJoCo's gainprm and biasprm; a wrong motor constant, ratio or supply.
     """
 
-    name, simplicity, related = "gain", 0, ("mass", "armature", "viscous_damping", "stiffness")
+    name, simplicity = "gain", 0
     acts_through = "control"
 
     def parameters(self, model, i):
@@ -204,7 +204,7 @@ class Gain(ActuatorEffect):
 class Bias(ActuatorEffect):
     """Force F + bias, in N·m or N of the actuator. Source: MuJoCo's biasprm[0]."""
 
-    name, related = "bias", ("spring_offset", "gravity")
+    name = "bias"
 
     def parameters(self, model, i):
         F = self.strength(model, i)
@@ -226,7 +226,7 @@ class BackEmf(ActuatorEffect):
     In a drive on one joint it is `viscous_damping`, but for a limited force. Source: biasprm[2].
     """
 
-    name, related = "back_emf", ("viscous_damping", "gain", "lag")
+    name = "back_emf"
     acts_through = "velocity"
 
     def parameters(self, model, i):
@@ -255,7 +255,7 @@ class Saturation(ActuatorEffect):
     Source: MuJoCo's forcerange; the limit of a motor's current.
     """
 
-    name, related = "saturation", ("gain",)
+    name = "saturation"
     acts_through = "control"
 
     def parameters(self, model, i):
@@ -299,7 +299,7 @@ class Lag(ActuatorEffect):
     """The command passes a first-order filter: seconds · ẏ = u − y. Source: MuJoCo's
     filterexact."""
 
-    name, related = "lag", ("delay", "back_emf", "time_step")
+    name = "lag"
     acts_through = "control"
 
     def fits(self, model, i):
@@ -331,7 +331,7 @@ class Delay(ActuatorEffect):
     """The command acts later: u(t − seconds), by any fraction of a time step. Source: MuJoCo's
     delay."""
 
-    name, simplicity, related = "delay", 0, ("lag", "sensor_delay", "time_step")
+    name, simplicity = "delay", 0
     acts_through = "control"
 
     def parameters(self, model, i):

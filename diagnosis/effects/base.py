@@ -113,7 +113,6 @@ class Effect:
     )
     together = 1  # of an effect with probes: how many in a row are tried as one
     simplicity = 1  # 0 for the first things to think of, up to 3; -1 for what is numerical
-    related = ()  # names of effects at the same joint in whose wrong value this one may hide
 
     def __repr__(self):
         return self.name
@@ -175,20 +174,6 @@ class Effect:
     def possible(self, values, nominal):
         """Whether a real machine can have these values, and not another effect by this name."""
         return True
-
-    def unseen(self, model, i, values, seen):
-        """The values with those that the recordings do not show (seen False) as the nominal model
-        has them.
-
-        Where physics ties them to the others, as near to that as these allow; what was seen never
-        moves.
-        """
-        nominal = (p.nominal for p in self.parameters(model, i))
-        return tuple(float(v if s else n) for v, n, s in zip(values, nominal, seen))
-
-    def canonical(self, values):
-        """The same effect in its usual numbers, where several sets of values mean the same."""
-        return values
 
     def build(self, spec, model, i):
         """Add to spec (of the nominal model) what edit() sizes."""

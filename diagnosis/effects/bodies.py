@@ -59,7 +59,7 @@ class InertialEffect(Effect):
 class Mass(InertialEffect):
     """Another mass, kg; the inertia scales along. Source: MuJoCo's inertial."""
 
-    name, simplicity, related = "mass", 0, ("gain", "armature", "inertia", "center_of_mass")
+    name, simplicity = "mass", 0
 
     def parameters(self, model, i):
         m = model.body_mass[i]
@@ -96,7 +96,7 @@ class CenterOfMass(InertialEffect):
     """The centre of mass lies elsewhere in the body's frame: x, y, z, m. Source: MuJoCo's
     inertial."""
 
-    name, related = "center_of_mass", ("mass", "inertia")
+    name = "center_of_mass"
 
     def fits(self, model, i):
         return super().fits(model, i) and turning(model, i)
@@ -120,7 +120,7 @@ class Inertia(InertialEffect):
     Of a rigid body none is larger than the sum of the others. Source: MuJoCo's inertial.
     """
 
-    name, related = "inertia", ("mass", "armature")
+    name = "inertia"
 
     def fits(self, model, i):
         return super().fits(model, i) and turning(model, i)
@@ -133,11 +133,6 @@ class Inertia(InertialEffect):
         """No principal moment of a rigid body is larger than the sum of the others; one at its
         nominal value did not show, and may be any."""
         return rigid(values) or any(v == n for v, n in zip(values, nominal))
-
-    def unseen(self, model, i, values, seen):
-        """What did not show goes back to its nominal value, or as near to it as a rigid body with
-        the others allows."""
-        return self._rigid(values, np.where(seen, np.nan, model.body_inertia[i]))
 
     @staticmethod
     def _rigid(values, back):
@@ -210,12 +205,7 @@ class LinkLength(Effect):
 class ExternalForce(Effect):
     """A constant force on a body's centre of mass, in world axes: x, y, z, N."""
 
-    name, kinds, simplicity, related = (
-        "external_force",
-        ("body",),
-        2,
-        ("gravity", "spring_offset", "bias"),
-    )
+    name, kinds, simplicity = "external_force", ("body",), 2
 
     def fits(self, model, i):
         return model.body_weldid[i] == i != 0 and model.body_mass[i] > 0
@@ -363,7 +353,7 @@ class SensorScale(SensorEffect):
 class SensorDelay(SensorEffect):
     """The sensor shows what was true some time ago: value(t − seconds)."""
 
-    name, related = "sensor_delay", ("delay", "time_step")
+    name = "sensor_delay"
 
     def parameters(self, model, i):
         return (Parameter("seconds", "s", 0.0, 0.0, 1.0, 0.001),)

@@ -95,7 +95,7 @@ class DeadZone(ActuatorEffect):
     pushes the way the joint moves it takes as much as `coulomb_friction`.
     """
 
-    name, simplicity, amplitudes, related = "dead_zone", 2, 1, ("coulomb_friction", "gain")
+    name, simplicity, amplitudes = "dead_zone", 2, 1
     acts_through = "control"
 
     def fits(self, model, i):
@@ -179,7 +179,7 @@ class RateLimit(DriveLimit):
     first control. Small steps pass as they are, unlike with a `lag`.
     """
 
-    name, law, simplicity, related = "rate_limit", "rate_limit", 2, ("lag", "delay", "gain")
+    name, law, simplicity = "rate_limit", "rate_limit", 2
 
     def parameters(self, model, i):
         u = self.strength(model, i) / max(abs(model.actuator_gainprm[i, 0]), 1e-12)
@@ -207,7 +207,6 @@ class TorqueSpeed(DriveLimit):
     """
 
     name, law, simplicity = "torque_speed", "torque_speed", 2
-    related = "saturation", "back_emf", "gain"
 
     def parameters(self, model, i):
         F, unit = self.strength(model, i), self.unit(model, i)
@@ -249,7 +248,6 @@ class GainFade(DriveLimit):
     """
 
     name, law, amplitudes, simplicity = "gain_fade", "gain_fade", 1, 2
-    related = ("gain",)
 
     def parameters(self, model, i):
         return (Parameter("rate", "1/s", 0.0, 0.0, 10.0, 0.01),)
@@ -268,7 +266,6 @@ class EffortFade(DriveLimit):
     """
 
     name, law, amplitudes, simplicity = "gain_fade", "effort_fade", 1, 3
-    related = ("gain",)
 
     def fits(self, model, i):
         return super().fits(model, i) and not model.actuator_biasprm[i, :3].any()

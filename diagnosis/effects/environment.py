@@ -17,7 +17,7 @@ FACTORS = (
 class Gravity(Effect):
     """Another gravity vector, m/s²: a tilted base, another strength. Source: MuJoCo's option."""
 
-    name, kinds, simplicity, related = "gravity", ("world",), 0, ("spring_offset", "bias", "mass")
+    name, kinds, simplicity = "gravity", ("world",), 0
 
     def parameters(self, model, i):
         return tuple(
@@ -72,7 +72,7 @@ class AirDrag(Effect):
     drag.
     """
 
-    name, kinds, related = "air_drag", ("world",), ("quadratic_damping", "viscous_damping")
+    name, kinds = "air_drag", ("world",)
 
     def parameters(self, model, i):
         return (
@@ -240,7 +240,7 @@ class ContactStiffness(ContactEffect):
     """Stiffness of all contacts of a geom, as an acceleration per depth, 1/s². Source:
     solref[0]."""
 
-    name, related = "contact_stiffness", ("contact_damping",)
+    name = "contact_stiffness"
 
     def parameters(self, model, i):
         k = _direct(self.pair(model, i)[2])[0]
@@ -259,7 +259,7 @@ class ContactDamping(ContactEffect):
     """Damping of all contacts of a geom, an acceleration per approach speed, 1/s. Source:
     solref[1]."""
 
-    name, related = "contact_damping", ("contact_stiffness",)
+    name = "contact_damping"
 
     def parameters(self, model, i):
         b = _direct(self.pair(model, i)[2])[1]

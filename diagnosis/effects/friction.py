@@ -19,7 +19,6 @@ from diagnosis.effects.base import (
 )
 from diagnosis.effects.drives import drive_torque, drives_of
 from diagnosis.effects.joints import (
-    DISSIPATION,
     SOLIMP_FRICTION,
     SOLREF_FRICTION,
     CoulombFriction,
@@ -49,7 +48,7 @@ class StribeckFriction(JointEffect):
     Armstrong-Hélouvry, Dupont, Canudas de Wit (1994).
     """
 
-    name, simplicity, related, amplitudes = "stribeck_friction", 3, DISSIPATION, 2
+    name, simplicity, amplitudes = "stribeck_friction", 3, 2
     acts_through = "velocity"
 
     def parameters(self, model, i):
@@ -118,7 +117,7 @@ class DryFriction(JointEffect):
     frictionloss."""
 
     law = ""  # in corrected.py
-    acts_through, simplicity, related = "velocity", 3, ("coulomb_friction", *DISSIPATION, "gain")
+    acts_through, simplicity = "velocity", 3
 
     def edit(self, model, i, values):
         d = model.jnt_dofadr[i]
@@ -242,10 +241,6 @@ class FrictionMap(DryFriction):
 
     def possible(self, values, nominal):
         return values[0] > 0 and values[1] > 0.05
-
-    def canonical(self, values):
-        level, contrast, waves, phase = values
-        return level, contrast, waves, phase % (2 * np.pi)
 
     def level(self, models, i, values):
         q = models[0].jnt_qposadr[i]

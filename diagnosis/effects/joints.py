@@ -29,7 +29,6 @@ STRENGTHS = (
     10.0,
     100.0,
 )  # of a force that grows faster than in proportion, over what turns the fastest motion round
-DISSIPATION = ("viscous_damping", "coulomb_friction", "quadratic_damping", "back_emf")
 
 
 class JointEffect(Effect):
@@ -136,7 +135,7 @@ class Armature(JointNumber):
     Source: MuJoCo's joint armature; a rotor of J_r behind gears of ratio n adds n² J_r.
     """
 
-    name, types, constants, related = "armature", (HINGE, SLIDE, BALL), True, ("mass", "gain")
+    name, types, constants = "armature", (HINGE, SLIDE, BALL), True
     number, compiled, authored, step = (
         ("armature", "kg·m²", "kg"),
         ("dof_armature", None),
@@ -149,7 +148,7 @@ class Armature(JointNumber):
 class ViscousDamping(JointNumber):
     """Force −d·v, d in N·m·s/rad or N·s/m. Source: MuJoCo's joint damping; Newtonian grease."""
 
-    name, types, simplicity, related = "viscous_damping", (HINGE, SLIDE, BALL), 0, DISSIPATION
+    name, types, simplicity = "viscous_damping", (HINGE, SLIDE, BALL), 0
     acts_through = "velocity"
     number, compiled, authored = (
         ("damping", "N·m·s/rad", "N·s/m"),
@@ -162,7 +161,7 @@ class ViscousDamping(JointNumber):
 class QuadraticDamping(JointNumber):
     """Force −d·v·|v|, d in N·m·s²/rad² or N·s²/m². Source: MuJoCo's damping polynomial; a fan."""
 
-    name, related = "quadratic_damping", DISSIPATION
+    name = "quadratic_damping"
     acts_through = "velocity"
     number, compiled, authored = (
         ("damping2", "N·m·s²/rad²", "N·s²/m²"),
@@ -186,7 +185,7 @@ class CoulombFriction(JointNumber):
     their difference. Source: MuJoCo's frictionloss, as stiff as a stuck joint needs.
     """
 
-    name, types, simplicity, related = "coulomb_friction", (HINGE, SLIDE, BALL), 0, DISSIPATION
+    name, types, simplicity = "coulomb_friction", (HINGE, SLIDE, BALL), 0
     acts_through = "velocity"
     number, compiled, authored = (
         ("frictionloss", "N·m", "N"),
@@ -212,7 +211,7 @@ class CoulombFriction(JointNumber):
 class Stiffness(JointNumber):
     """Force −k·(q − springref), k in N·m/rad or N/m. Source: MuJoCo's joint stiffness."""
 
-    name, related = "stiffness", ("spring_offset", "nonlinear_stiffness", "gain")
+    name = "stiffness"
     acts_through = "position"
     number, compiled, authored, step = (
         ("stiffness", "N·m/rad", "N/m"),
@@ -226,7 +225,7 @@ class Stiffness(JointNumber):
 class NonlinearStiffness(JointNumber):
     """Force −k·(q − springref)³, k in N·m/rad³ or N/m³. Source: MuJoCo's stiffness polynomial."""
 
-    name, simplicity, related = "nonlinear_stiffness", 2, ("stiffness", "spring_offset")
+    name, simplicity = "nonlinear_stiffness", 2
     acts_through = "position"
     number, compiled, authored = (
         ("stiffness3", "N·m/rad³", "N/m³"),
@@ -252,7 +251,7 @@ class SpringOffset(JointEffect):
     With `coulomb_friction` beside it, friction that differs by direction.
     """
 
-    name, related = "spring_offset", ("stiffness", "bias", "coulomb_friction")
+    name = "spring_offset"
 
     def parameters(self, model, i):
         M = self.scale(model, i)
@@ -329,10 +328,6 @@ class Cogging(JointEffect):
     def merged(self, rows, amounts):
         wave = sum(amount * row[0] * np.exp(1j * row[2]) for row, amount in zip(rows, amounts))
         return (rows[0][0], rows[0][1], float(np.angle(wave))), abs(wave) / rows[0][0]
-
-    def canonical(self, values):
-        amplitude, poles, phase = values
-        return abs(amplitude), poles, (phase + np.pi * (amplitude < 0)) % (2 * np.pi)
 
     def _motor(self, model, i):
         return f"cogging:{model.joint(i).name}"

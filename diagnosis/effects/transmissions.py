@@ -22,7 +22,6 @@ from diagnosis.effects.base import (
     runge_kutta,
 )
 from diagnosis.effects.joints import (
-    DISSIPATION,
     SOLIMP_FRICTION,
     SOLREF_FRICTION,
     JointEffect,
@@ -52,12 +51,7 @@ class Presliding(JointEffect):
     bristle as it is after the motion recorded before.
     """
 
-    name, simplicity, amplitudes, related = (
-        "presliding",
-        3,
-        2,
-        ("coulomb_friction", "stiffness", *DISSIPATION),
-    )
+    name, simplicity, amplitudes = "presliding", 3, 2
     acts_through = "position"
 
     def _stiffest(self, model, i):
@@ -188,7 +182,7 @@ class JointElasticity(Backlash):
     Source: Spong, Modeling and Control of Elastic Joint Robots (1987).
     """
 
-    name, simplicity, amplitudes, related = "joint_elasticity", 3, 0, ("delay", "lag", "backlash")
+    name, simplicity, amplitudes = "joint_elasticity", 3, 0
 
     def _reduced(self, model, i):
         """Inertia of motor and link swinging against each other."""
@@ -284,7 +278,7 @@ class CoupledFriction(CoupledEffect):
     """
 
     name, number, field, acts_through = "coupled_friction", "level", "frictionloss", "velocity"
-    unit_names, related = ("N·m", "N"), DISSIPATION
+    unit_names = "N·m", "N"
 
 
 @catalogue
@@ -296,7 +290,7 @@ class CoupledInertia(CoupledEffect):
     """
 
     name, number, field, constants = "coupled_inertia", "inertia", "armature", True
-    unit_names, related = ("kg·m²", "kg"), ("armature", "mass")
+    unit_names = "kg·m²", "kg"
 
 
 def pairs(model):

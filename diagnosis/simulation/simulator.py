@@ -41,52 +41,23 @@ class World:
         self.spec = spec.copy()
         with quiet():
             self.spec.compile()
-            s = self.spec
-            for elements in (s.joints, s.actuators, s.bodies[1:], s.geoms, s.sensors):
-                taken = {e.name for e in elements}
-                for element in elements:
-                    if not element.name:
-                        index = str(element.id)
-                        element.name = f"index {index}" if index in taken else index
-            self.model = m = self.spec.compile()
-        for (
-            actuator
-        ) in s.actuators:  # what the compiler works out of the mass, it would again of another one
-            if actuator.biasprm[2] > 0:
-                actuator.biasprm[2] = m.actuator(actuator.name).biasprm[2]
-            if actuator.inheritrange > 0:  # of the joint, whose range may be what is wrong
-                field = (
-                    "actrange"
-                    if actuator.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
-                    else "ctrlrange"
-                )
-                setattr(actuator, field, getattr(m.actuator(actuator.name), field).ravel())
-                actuator.inheritrange = 0
-        for joint in s.joints:
-            if any(joint.springdamper):
-                j = m.joint(joint.name)
-                joint.stiffness, joint.damping, joint.springdamper = (
-                    [j.stiffness[0], 0, 0],
-                    [j.damping[0], 0, 0],
-                    [0, 0],
-                )
-        self.candidates, taken = (
-            [],
-            {e.name for e in (*self.spec.actuators, *self.spec.joints, *self.spec.tendons)},
-        )
-        for effect in EFFECTS:
-            for name in effect.places(self.model):
-                if (
-                    f"{effect.name}:{name}" in taken
-                ):  # this model is a corrected one, which has it already
-                    continue
-                parameters = effect.parameters(self.model, effect.id(self.model, name))
-                self.candidates.append(
-                    Candidate(effect, Place(effect.kind, name), tuple(parameters))
-                )
+            _name_all(self.spec)
+            self.model = self.spec.compile()
+        _keep_compiled(self.spec, self.model)
+        # a model that is a corrected one has some of the effects already
+        s, taken = self.spec, set()
+        for elements in (s.actuators, s.joints, s.tendons):
+            taken |= {element.name for element in elements}
+        self.candidates = [
+            Candidate(effect, Place(effect.kind, name), self._parameters(effect, name))
+            for effect in EFFECTS
+            for name in effect.places(self.model)
+            if f"{effect.name}:{name}" not in taken
+        ]
         self._engines = {}
-        # of start states, that shooting remembers for as long as this world is looked at
-        self.fits = {}
+
+    def _parameters(self, effect, name):
+        return tuple(effect.parameters(self.model, effect.id(self.model, name)))
 
     @classmethod
     def load(cls, path):
@@ -157,21 +128,6 @@ class World:
             candidate,
             parameters=candidate.effect.suited(candidate.parameters, self.model, i, recordings),
         )
-
-    def related(self, candidate):
-        """Candidates at the same joints in whose wrong values this one may hide, or theirs in
-        its."""
-        mine, out = self.joints(candidate.place), []
-        for other in self.candidates:
-            theirs = self.joints(other.place)
-            akin = (
-                other.effect.name in candidate.effect.related
-                or candidate.effect.name in other.effect.related
-            )
-            if akin and other.effect.name != candidate.effect.name:
-                if mine is None or theirs is None or mine & theirs:
-                    out.append(other)
-        return out
 
     def joints(self, place):
         """Ids of the joints a place belongs to, or None for all."""
@@ -271,43 +227,68 @@ class World:
         held. Values keep all their digits; paths of meshes and other files become absolute.
         """
         spec, written = self.spec.copy(), {candidate: "mjcf" for candidate in setting}
-        time_step_first = lambda item: (
-            not item[0].effect.numerical
-        )  # delays, lags and friction are written by it
-        for candidate, values in sorted(Case(self.model, setting, 1).on, key=time_step_first):
+        # the time step first: delays, lags and friction are written by it
+        last = lambda item: not item[0].effect.numerical
+        for candidate, values in sorted(Case(self.model, setting, 1).on, key=last):
             i = candidate.effect.id(self.model, candidate.place.name)
-            written[candidate] = (
-                "none" if candidate.when else candidate.effect.write(spec, self.model, i, values)
-            )
-        for actuator in (
-            spec.actuators
-        ):  # the history must reach back far enough, whatever the time step became
+            held = "none" if candidate.when else candidate.effect.write(spec, self.model, i, values)
+            written[candidate] = held
+        for actuator in spec.actuators:  # its history must reach back far enough
             if actuator.delay > 0:
-                actuator.nsample = max(
-                    actuator.nsample, int(np.ceil(actuator.delay / spec.option.timestep - 1e-9)) + 1
-                )
+                late = int(np.ceil(actuator.delay / spec.option.timestep - 1e-9))
+                actuator.nsample = max(actuator.nsample, late + 1)
         folder = Path(self.spec.modelfiledir).absolute()
         spec.meshdir, spec.texturedir = (
-            str(folder / self.spec.meshdir),
-            str(folder / self.spec.texturedir),
+            str(folder / part) for part in (self.spec.meshdir, self.spec.texturedir)
         )
         spec.compiler.savecompiled = spec.compiler.savecanonical = False
         with quiet():
-            model = spec.compile()
-            for key, old in zip(
-                spec.keys, self.model.key_qpos
-            ):  # joints may have been added between the others, and zeros moved
-                place = model.qpos0.copy()
-                for mine in map(self.model.joint, range(self.model.njnt)):
-                    its, width = model.joint(mine.name), len(mine.qpos0)
-                    moved = its.qpos0 - mine.qpos0 if mine.type[0] in (HINGE, SLIDE) else 0.0
-                    place[its.qposadr[0] : its.qposadr[0] + width] = (
-                        old[mine.qposadr[0] : mine.qposadr[0] + width] + moved
-                    )
-                key.qpos = place
             if spec.keys:
-                spec.compile()
+                self._move_keys(spec)
+            spec.compile()
             return spec.to_xml(), written
+
+    def _move_keys(self, spec):
+        """Fit the keyframes of a corrected spec to its joints: some may have been added between
+        the others, and zeros moved."""
+        model = spec.compile()
+        for key, old in zip(spec.keys, self.model.key_qpos):
+            place = model.qpos0.copy()
+            for mine in map(self.model.joint, range(self.model.njnt)):
+                its, width = model.joint(mine.name), len(mine.qpos0)
+                moved = its.qpos0 - mine.qpos0 if mine.type[0] in (HINGE, SLIDE) else 0.0
+                at, of = its.qposadr[0], mine.qposadr[0]
+                place[at : at + width] = old[of : of + width] + moved
+            key.qpos = place
+
+
+def _name_all(spec):
+    """Give a name to every joint, actuator, body, geom and sensor of a compiled spec: its index."""
+    for elements in (spec.joints, spec.actuators, spec.bodies[1:], spec.geoms, spec.sensors):
+        taken = {element.name for element in elements}
+        for element in elements:
+            if not element.name:
+                index = str(element.id)
+                element.name = f"index {index}" if index in taken else index
+
+
+def _keep_compiled(spec, model):
+    """Write into spec what the compiler works out of other numbers: of another mass or range it
+    would work out something else, and these may be what is wrong."""
+    for actuator in spec.actuators:
+        compiled = model.actuator(actuator.name)
+        if actuator.biasprm[2] > 0:
+            actuator.biasprm[2] = compiled.biasprm[2]
+        if actuator.inheritrange > 0:
+            integrates = actuator.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
+            field = "actrange" if integrates else "ctrlrange"
+            setattr(actuator, field, getattr(compiled, field).ravel())
+            actuator.inheritrange = 0
+    for joint in spec.joints:
+        if any(joint.springdamper):
+            compiled = model.joint(joint.name)
+            joint.stiffness = [compiled.stiffness[0], 0, 0]
+            joint.damping, joint.springdamper = [compiled.damping[0], 0, 0], [0, 0]
 
 
 def step_of(model, setting):
