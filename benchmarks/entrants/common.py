@@ -3,9 +3,9 @@
 Nothing here is the diagnosis' own: an entrant is what a user would write with other tools.
 """
 
+import argparse
 import csv
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,14 +26,24 @@ class Recording:
     ctrl: np.ndarray
 
 
-def arguments():
-    """(MjSpec, [Recording], folder for the report) from the command line MODEL RECORDINGS… OUT."""
-    model, *recordings, out = sys.argv[1:]
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    spec = mujoco.MjSpec.from_file(model)
+def words(what, **first):
+    """The command line MODEL RECORDINGS… OUT as a namespace, behind a word of its own where one is
+    given: its name, and the options of add_argument."""
+    parser = argparse.ArgumentParser(description=what)
+    for name, options in first.items():
+        parser.add_argument(name, **options)
+    parser.add_argument("model", type=Path, help="the simulator, MJCF")
+    parser.add_argument("recordings", type=Path, nargs="+", help="CSV files of the contract")
+    parser.add_argument("out", type=Path, help="folder for diagnosis.json and what corrects")
+    return parser.parse_args()
+
+
+def opened(args):
+    """(MjSpec, [Recording], folder for the report) that words() names."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    spec = mujoco.MjSpec.from_file(str(args.model))
     compiled = spec.compile()
-    return spec, [read(path, compiled) for path in recordings], out
+    return spec, [read(path, compiled) for path in args.recordings], args.out
 
 
 def read(path, model):

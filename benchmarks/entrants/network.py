@@ -17,7 +17,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from common import arguments, states, write  # noqa: E402
+from common import opened, states, words, write  # noqa: E402
 
 WIDTH, EPOCHS, RATE, DECAY = 48, 300, 3e-3, 1e-4
 
@@ -97,7 +97,7 @@ def train(inputs, targets):
 
 def main():
     """Learn, and write the nominal model with the network beside it."""
-    spec, recordings, out = arguments()
+    spec, recordings, out = opened(words(main.__doc__))
     weights = train(*examples(spec.compile(), recordings))
     np.savez(out / "network.npz", **weights)
     write(out, spec)

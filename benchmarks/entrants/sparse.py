@@ -15,7 +15,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from common import arguments, finding, states, write  # noqa: E402
+from common import finding, opened, states, words, write  # noqa: E402
 from fields import fields  # noqa: E402
 
 SHARE = 0.05  # of the joint's force, below which a term is dropped
@@ -73,7 +73,7 @@ def regress(columns, force, usual):
 
 def main():
     """Regress joint by joint, name the terms, write those that MJCF holds."""
-    spec, recordings, out = arguments()
+    spec, recordings, out = opened(words(main.__doc__))
     model, findings = spec.compile(), []
     motions = [forces(model, recording) for recording in recordings]
     known = {(f.effect, f.name): f for f in fields(spec)}

@@ -16,7 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from common import arguments, finding, states, write  # noqa: E402
+from common import finding, opened, states, words, write  # noqa: E402
 from fields import fields  # noqa: E402
 from mujoco import sysid  # noqa: E402
 
@@ -119,11 +119,13 @@ def by_bic(candidates, residual):
 def main():
     """Fit, name what differs, write the model with it."""
     logging.disable(logging.WARNING)
-    which = sys.argv.pop(1)
-    spec, recordings, out = arguments()
-    candidates = fields(spec, usual=which == "usual")
+    args = words(main.__doc__, which={"choices": ("all", "usual"), "help": "of the parameters"})
+    if not hasattr(sysid, "build_residual_fn"):
+        sys.exit("mujoco.sysid is not installed whole: pip install -r requirements-extras.txt")
+    spec, recordings, out = opened(args)
+    candidates = fields(spec, usual=args.which == "usual")
     residual = sysid.build_residual_fn(models_sequences=[sequences(spec, recordings)])
-    if which == "usual":
+    if args.which == "usual":
         chosen, values, half = by_bic(candidates, residual)
     else:
         chosen = candidates

@@ -5,6 +5,7 @@
 The commit is unpacked once into a folder of the system's temporary files.
 """
 
+import argparse
 import os
 import subprocess
 import sys
@@ -34,10 +35,15 @@ def unpacked(commit):
 
 def main():
     """Run that version's diagnose.py in place of this process."""
-    commit, model, *recordings, out = sys.argv[1:]
-    script = unpacked(commit) / "diagnose.py"
-    words = [script, "--model", model, "--recordings", *recordings, "--out", out]
-    os.execv(sys.executable, [sys.executable, *map(str, words)])
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("commit", help="of this repository")
+    parser.add_argument("model", help="the simulator, MJCF")
+    parser.add_argument("recordings", nargs="+", help="CSV files of the contract")
+    parser.add_argument("out", help="folder for the report")
+    args = parser.parse_args()
+    script = unpacked(args.commit) / "diagnose.py"
+    line = [script, "--model", args.model, "--recordings", *args.recordings, "--out", args.out]
+    os.execv(sys.executable, [sys.executable, *map(str, line)])
 
 
 if __name__ == "__main__":
