@@ -331,7 +331,7 @@ class Delay(ActuatorEffect):
     """The command acts later: u(t − seconds), by any fraction of a time step. Source: MuJoCo's
     delay."""
 
-    name, simplicity = "delay", 0
+    name, simplicity, delays = "delay", 0, True
     acts_through = "control"
 
     def parameters(self, model, i):

@@ -107,6 +107,7 @@ class Effect:
     acts_through = ""  # what its force varies with: velocity, position, control or contact
     loaded = True  # limit() reads qfrc_bias
     numerical = False  # the simulator's own method, no physics
+    delays = False  # its one value is the time by which something is late
     timed = False  # differs from a simpler effect only under a condition
     amplitudes = (
         0  # of an effect with probes: how many of its first parameters it acts in proportion to

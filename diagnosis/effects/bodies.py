@@ -353,7 +353,7 @@ class SensorScale(SensorEffect):
 class SensorDelay(SensorEffect):
     """The sensor shows what was true some time ago: value(t − seconds)."""
 
-    name = "sensor_delay"
+    name, delays = "sensor_delay", True
 
     def parameters(self, model, i):
         return (Parameter("seconds", "s", 0.0, 0.0, 1.0, 0.001),)

@@ -64,6 +64,7 @@ class Ahead:
         self.qpos, self.qvel = windowing.recorded_starts(self.model, windows)
         self.spread = np.zeros((len(windows), 2 * self.model.nv))  # of start states
         self.base, self._freedom = {}, None
+        self.coarse = {}  # {time_step: seconds} of what is a difference, where it is another
 
     def _travel(self):
         start = self.measured[:, :1]
@@ -98,8 +99,8 @@ class Ahead:
         moved[1 + np.arange(n), :, np.arange(n)] = self.spread.T
         moved = moved.reshape(-1, n)
         qpos = windowing.integrate(self.model, np.tile(self.qpos, (1 + n, 1)), moved[:, :nv])
-        qvel = np.tile(self._velocities(self.base, 1), (1 + n, 1)) + moved[:, nv:]
-        each = [self.base] * len(moved)
+        qvel = np.tile(self.qvel, (1 + n, 1)) + moved[:, nv:]
+        each = [self.roughly(self.base)] * len(moved)
         qpos = self.world.simulate(each, qpos, qvel, self.windows * (1 + n))[0]
         gaps = self._gaps(qpos.reshape(1 + n, W, *qpos.shape[1:]))
         change = gaps[0] - gaps[1:]
@@ -109,13 +110,25 @@ class Ahead:
     def residual(self, settings, refine=1):
         """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther
         than the travel. refine: the time step is divided by it."""
-        n, W = len(settings), len(self.windows)
-        each = [s for s in settings for _ in range(W)]
         qvel = np.concatenate([self._velocities(s, refine) for s in settings])
-        qpos = self.world.simulate(
-            each, np.tile(self.qpos, (n, 1)), qvel, self.windows * n, refine
-        )[0]
-        return self._gaps(qpos.reshape(n, W, *qpos.shape[1:]))
+        return self._simulated(settings, qvel, refine)
+
+    def rough(self, settings):
+        """As of residual(), for columns, which are differences of two of these: what a coarse step
+        does wrong it does in both."""
+        return self._simulated(
+            [*map(self.roughly, settings)], np.tile(self.qvel, (len(settings), 1))
+        )
+
+    def roughly(self, setting):
+        """A setting with the time step of columns."""
+        return {**with_own_step(setting), **self.coarse}
+
+    def _simulated(self, settings, qvel, refine=1):
+        n, each = len(settings), [s for s in settings for _ in self.windows]
+        starts = np.tile(self.qpos, (n, 1)), qvel
+        qpos = self.world.simulate(each, *starts, self.windows * n, refine)[0]
+        return self._gaps(qpos.reshape(n, len(self.windows), *qpos.shape[1:]))
 
     def _gaps(self, qpos):
         """Measured less predicted (n, W, T, nv) of predictions (n, W, T, nq)."""

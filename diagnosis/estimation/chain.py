@@ -14,7 +14,7 @@ is the missing one they are equal, whatever its size.
 import numpy as np
 
 from diagnosis.estimation import windowing
-from diagnosis.estimation.ahead import Ahead
+from diagnosis.estimation.ahead import Ahead, with_own_step
 from diagnosis.simulation.rows import RowMap, coarse
 
 ASTRAY = 1e3  # times its travel, to where a chain of transitions at stiff stops may run away
@@ -53,6 +53,8 @@ class Chain(Ahead):
         rough = self._rows({**self.coarse, **self.base}, self.begin)
         self.finer, self.beyond = self._rows({**step, **self.base}, self.begin) - rough, {}
         self.contacts = self._begun([self.windows[i] for i in self.touched])
+        for part in filter(None, (self.whole, self.contacts)):
+            part.coarse = coarse(self.world, trajectory.first, touching=True)
         self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
 
     def beginnings(self, number, seconds):
@@ -73,13 +75,21 @@ class Chain(Ahead):
 
     def residual(self, settings, refine=1):
         """Measured less predicted, (settings, W, T, nv), as of Ahead."""
+        return self._predicted(settings, lambda contacts: contacts.residual(settings, refine))
+
+    def rough(self, settings):
+        """As of Ahead."""
+        some = [with_own_step(setting) for setting in settings]
+        return self._predicted(some, lambda contacts: contacts.rough(some))
+
+    def _predicted(self, settings, simulated):
         out = np.zeros((len(settings), *self.known.shape))
         if len(self.used):
             plain = [self.plain(s) for s in settings]
             self._along(plain, out)
             self._beyond(settings, plain, out)
         if self.contacts:
-            rest = self.contacts.residual(settings, refine)
+            rest = simulated(self.contacts)
             out[:, self.touched] = 0.0
             out[:, self.touched, : rest.shape[2]] = rest
         return out
@@ -118,10 +128,13 @@ class Chain(Ahead):
         more = [{c: v for c, v in s.items() if c not in p} for s, p in zip(settings, plain)]
         new = {frozenset(m.items()): m for m in more if m}
         new = {key: m for key, m in new.items() if key not in self.beyond}
-        if new:
-            every = [self.base, *({**self.base, **m} for m in new.values())]
-            first, *rest = self.whole.residual(every)
-            self.beyond |= {key: both - first for key, both in zip(new, rest)}
+        numerical = lambda c: c.effect.numerical
+        for exact, simulated in ((True, self.whole.residual), (False, self.whole.rough)):
+            some = {key: m for key, m in new.items() if exact == any(map(numerical, m))}
+            if some:
+                every = [self.base, *({**self.base, **m} for m in some.values())]
+                first, *rest = simulated(every)
+                self.beyond |= {key: both - first for key, both in zip(some, rest)}
         for row, m in zip(out, more):
             if m:
                 row += self.beyond[frozenset(m.items())]

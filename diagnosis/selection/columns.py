@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.estimation.ahead import with_own_step
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.starts import Start
 
@@ -72,9 +71,9 @@ class Columns:
         self.options, self.simulated = [], int(residual is None)
         self.seen = {} if seen is None else seen
         self.residual = ahead.residual([setting])[0] if residual is None else residual
-        self.rough = self.residual  # with the simulator's own step, as columns are differences
-        if with_own_step(setting) != setting:
-            self.rough = ahead.residual([with_own_step(setting)])[0]
+        self.rough = self.residual
+        if ahead.roughly(setting) != setting:
+            self.rough = ahead.rough([setting])[0]
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts, self.begun = [], []  # the Start of every option
         self._simulate(starts)
@@ -97,21 +96,15 @@ class Columns:
 
     def _simulate(self, starts):
         """Simulate starts; those that change nothing are left out."""
-        starts = sorted(starts, key=lambda start: stepwise(self.world, start.candidate))
-        settings, bases, changes = [], [], []
-        for start in starts:
-            finer, some = start.candidate.effect.numerical, start.settings(self.setting)
-            settings += some if finer else map(with_own_step, some)
-            bases += [self.residual if finer else self.rough] * len(some)
-        for k in range(0, len(settings), TOGETHER):
-            gaps = self.ahead.residual(settings[k : k + TOGETHER])
-            for base, gap in zip(bases[k:], gaps):
-                with np.errstate(over="ignore"):
-                    change = (base - gap).astype(np.float32)
-                gone = self.lost | (abs(gap) >= self.ahead.travel) | ~np.isfinite(change)
-                changes.append(np.where(gone, np.float32(0.0), change))
-        self.simulated += len(settings)
-        changes = iter(changes)
+        numerical = lambda start: start.candidate.effect.numerical
+        physics = [start for start in starts if not numerical(start)]
+        physics = sorted(physics, key=lambda start: stepwise(self.world, start.candidate))
+        steps, ahead = [*filter(numerical, starts)], self.ahead
+        changes = iter(
+            self._changes(ahead.rough, self.rough, physics)
+            + self._changes(ahead.residual, self.residual, steps)
+        )
+        starts = physics + steps
         for start in starts:
             own = [next(changes) for _ in start.directions]
             seen = np.array([self._shows(c) for c in own])
@@ -123,6 +116,19 @@ class Columns:
             shown = {f: getattr(start, f)[seen] for f in ("directions", "low", "high")}
             self.options.append(Option(**vars(start) | shown, columns=columns))
             self.begun.append(start)
+
+    def _changes(self, residual, base, starts):
+        """[(W, T, nv)] of all directions of starts: base, less the residual with them."""
+        settings = [setting for start in starts for setting in start.settings(self.setting)]
+        changes = []
+        for k in range(0, len(settings), TOGETHER):
+            for gap in residual(settings[k : k + TOGETHER]):
+                with np.errstate(over="ignore"):
+                    change = (base - gap).astype(np.float32)
+                gone = self.lost | (abs(gap) >= self.ahead.travel) | ~np.isfinite(change)
+                changes.append(np.where(gone, np.float32(0.0), change))
+        self.simulated += len(settings)
+        return changes
 
     def _remember(self, start, shows):
         """Keep which parameters of a candidate show at all, so that later columns leave out the

@@ -39,8 +39,8 @@ def classes(candidates, judge, missing, fitted, begun, log=lambda what: None):
         if own is not candidate:
             log(f"  better in its class: {candidate} -> {own}")
             swapped = True
-        tied = [(f, o) for f, o in members if _tied(f.score, fitted.score)]
-        others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
+        equal = [(f, o) for f, o in members if tied(f.score, fitted.score)]
+        others[own] = [(o, f.setting[o]) for f, o in equal if o is not own]
         told = {o for o, _ in others[own]}
         pool = [c for c in candidates if c not in told and c not in fitted.setting]
         others[own] += _late(pool, begun, missing.chain.world, fitted, own)
@@ -57,11 +57,11 @@ def _members(candidates, judge, before, fitted, candidate):
     near = _alike(judge, missing, fitted, candidate, pool)
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
-        if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
+        if not tried.settled or not (tied(tried.score, fitted.score) or tried.loss < fitted.loss):
             continue
         tried = judge.fit(tried.setting)  # forces tell values better than the motion
         lacks = missing.scores(tried.setting, fitted.setting)
-        if lacks is None or _tied(*lacks):
+        if lacks is None or tied(*lacks):
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
@@ -69,24 +69,38 @@ def _members(candidates, judge, before, fitted, candidate):
 def _late(pool, begun, world, fitted, candidate):
     """[(other, values)] of a delay in the drive for one in the sensor, or the other way round, that
     predict as well: either begins at states of its own, for a late sensor shows others."""
-    late = lambda c: (
-        c.effect.overrides("measure") and c.effect.measure(np.ones(len(c.parameters)))[2] > 0
-    )
-    near = [c for c in world.related(candidate) if c in pool and late(c) != late(candidate)]
-    near = [c for c in near if world.joints(c.place)]
-    if not near or not world.joints(candidate.place):
+    if not candidate.effect.delays:
         return []
+    mine = world.joints(candidate.place) or set()
+    near = [c for c in pool if c.effect.delays and c.effect is not candidate.effect]
+    near = [c for c in near if mine & (world.joints(c.place) or set())]
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     out = []
     for other in near:
         held = {**rest, other: fitted.setting[candidate]}
         tried = begun(held).fit(held)
-        if tried.settled and _tied(tried.score, fitted.score):
+        if tried.settled and tied(tried.score, fitted.score):
             out.append((other, tried.setting[other]))
     return out
 
 
-def _tied(tried, fitted):
+def sets(judged, judge, fitted, told):
+    """Of Fitted sets that were judged, those that predict as well as another one, refitted, the
+    simplest first: of other effects than its own and those told in their places."""
+    physics = lambda setting: {c for c in setting if not c.effect.numerical}
+    mine, most, out = physics(fitted.setting), complexity(fitted.setting) + FURTHER, []
+    step = {c: v for c, v in fitted.setting.items() if c not in mine}
+    for other in sorted(judged, key=lambda f: complexity(f.setting)):
+        names = physics(other.setting)
+        if names <= {*mine, *told} or names >= mine:
+            continue
+        tried = judge.fit({**other.setting, **step})
+        if tried.settled and complexity(tried.setting) <= most and tied(tried.score, fitted.score):
+            out.append(tried)
+    return out
+
+
+def tied(tried, fitted):
     """Whether a Score is as good as another one, or worse by no more than chance."""
     worse = paired(tried, fitted)
     return worse.gain < TIED or worse.p_value > CHANCE
@@ -124,12 +138,11 @@ def _near(world, candidate, pool):
     """Candidates of a pool that act where a finding does, or everywhere."""
     mine = world.joints(candidate.place)
     most = complexity([candidate]) + FURTHER
-    related = set(world.related(candidate))
     out = []
     for other in pool:
         theirs = world.joints(other.place)
         if complexity([other]) > most:
             continue
-        if other in related or mine is None or theirs is None or mine & theirs:
+        if mine is None or theirs is None or mine & theirs:
             out.append(other)
     return out

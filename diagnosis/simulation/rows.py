@@ -21,17 +21,19 @@ SWING = 0.3  # rad of phase, or share of the decay, of the fastest joint's motio
 SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per second, of the force
 
 
-def coarse(world, recordings):
-    """{time_step: seconds}: a few steps in a row, for what is a difference of two simulations."""
+def coarse(world, recordings, touching=False):
+    """{time_step: seconds}: a few steps in a row, for what is a difference of two simulations.
+    touching: that something touches in."""
     own = world.model.opt.timestep
     seconds = np.median(np.concatenate([np.diff(r.time) for r in recordings])) / STEPS
-    seconds = min(seconds, SWING / max(_fastest(world.model), 1e-9))
+    seconds = min(seconds, SWING / max(_fastest(world.model, touching), 1e-9))
     # never quite the simulator's own, with which Euler's method would be explicit in drives
     return {world.candidate("time_step", "world"): (float(np.nextafter(max(seconds, own), 0)),)}
 
 
-def _fastest(model):
-    """The highest rate, 1/s, at which a joint's springs, dampers and servos act on its inertia."""
+def _fastest(model, touching):
+    """The highest rate, 1/s, at which a joint's springs, dampers and servos act on its inertia, and
+    what touches gives way."""
     stiff, slow = np.zeros(model.nv), model.dof_damping.copy()
     for j in range(model.njnt):
         stiff[model.jnt_dofadr[j]] = model.jnt_stiffness[j]
@@ -42,7 +44,18 @@ def _fastest(model):
             stiff[d] -= gear * model.actuator_biasprm[a, 1]
             slow[d] -= gear * model.actuator_biasprm[a, 2]
     yields = model.dof_invweight0
-    return float(np.maximum(np.sqrt(np.maximum(stiff, 0.0) * yields), slow * yields).max(initial=0))
+    rates = [np.sqrt(np.maximum(stiff, 0.0) * yields), slow * yields]
+    if touching:
+        rates += [_contact_rates(model.geom_solref), _contact_rates(model.jnt_solref)]
+    return float(np.concatenate(rates).max(initial=0))
+
+
+def _contact_rates(solref):
+    """Of contacts or limits (n, 2), as MuJoCo's solref has them: a time constant and a damping
+    ratio, or stiffness and damping, negative."""
+    first, second = solref.T
+    direct = np.maximum(np.sqrt(np.maximum(-first, 0.0)), -second)
+    return np.where(first < 0, direct, 1 / np.maximum(first * np.maximum(second, 1), 1e-9))
 
 
 class RowMap:

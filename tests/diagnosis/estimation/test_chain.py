@@ -1,5 +1,7 @@
 """Columns along the measured motion, against the missing force and against the simulator."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
@@ -67,6 +69,17 @@ def test_what_is_no_force_is_simulated(here):
     np.testing.assert_allclose(along[1] - along[0], simulated[1] - simulated[0], atol=1e-12)
 
 
+def test_a_finer_time_step_has_a_column(here):
+    world, _, chain = here
+    step = {world.candidate("time_step", "world"): (0.00125,)}
+    ahead = Ahead(world, chain.windows, chain.noise)
+    ahead.start(chain.trajectory)
+    along, simulated = (a.residual([{}, step]) for a in (chain, ahead))
+    np.testing.assert_allclose(along[1] - along[0], simulated[1] - simulated[0], atol=1e-12)
+    rough = chain.rough([{}, step])
+    np.testing.assert_array_equal(rough[0], rough[1])
+
+
 def test_a_start_state_moves_predictions_as_in_the_simulator():
     world, truth, chain = located(VISCOUS)
     trajectory = Smoother(world, list(chain.trajectory.first)).locate(truth)
@@ -126,6 +139,28 @@ def test_coarse_steps_are_no_longer_than_the_stiffest_servo_allows(kp):
     [(_, (step,))] = rows.coarse(world, runs).items()
     assert own < step + 1e-12 <= max(own, 0.3 / np.sqrt(max(kp, 1e-9) / inertia)) + 2e-12
     assert (step > own) == (kp < 1000)
+
+
+BOUNCING = """<mujoco><option timestep="0.001"/><worldbody>
+  <geom name="ground" type="plane" size="5 5 .1" solref="{solref}"/>
+  <body name="ball" pos="0 0 .3"><joint name="drop" type="slide" axis="0 0 1" damping="0.2"/>
+    <geom type="sphere" size=".1" mass="1" solref="{solref}"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "solref, rate",
+    [("0.02 1", 50.0), ("0.02 4", 50 / 4), ("-10000 -20", 100.0), ("-100 -90", 90.0)],
+)
+def test_coarse_steps_are_no_longer_than_a_contact_allows(solref, rate):
+    world = World(mujoco.MjSpec.from_string(BOUNCING.format(solref=solref)))
+    time = 0.1 * np.arange(50)
+    runs = [SimpleNamespace(time=time)]
+    [(_, (free,))] = rows.coarse(world, runs).items()
+    [(_, (touching,))] = rows.coarse(world, runs, touching=True).items()
+    assert free == pytest.approx(0.05)
+    # the joint has MuJoCo's own limit, a time constant of 20 ms
+    assert touching == pytest.approx(0.3 / max(rate, 50.0))
 
 
 def test_the_same_damping_in_a_drive_and_in_a_joint_does_the_same_in_a_row():
