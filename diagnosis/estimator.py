@@ -77,45 +77,17 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         search = Identification(world, transients.calm(train, event), say, log)
         found = search.run()
     say(0.75, "what could stand in a finding's place")
-    checks = _checks(world, found, held_out or train, kept_back or held_out or train)
-    fitted, others = _decided(search, found, checks[-1], log)
+    fitted, others = _classes(search, found, found.fitted, log, search.candidates)
+    if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
+        fitted = search.pruned(found.judge, fitted, found.judge.fit({}))
+    fitted = changing(found.judge, fitted)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
     outcome.event, outcome.earned = event, bool(outcome.fitted.setting or event)
     say(0.85, "checking what is handed over")
-    _hand_over(search, checks, outcome, log)
+    _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
     say(0.95, "held-out error")
     return findings.assemble(world, train, held_out, outcome)
-
-
-def _checks(world, found, held_out, kept_back):
-    """(Check of the errors that are told, Check that decides)."""
-    noise, check = (
-        found.smoother.position_noise,
-        lambda some: Check(world, some, Smoother(world, some), noise),
-    )
-    told = check(held_out)
-    return told, told if kept_back is held_out else check(kept_back)
-
-
-def _decided(search, found, check, log):
-    """(Fitted, classes): the set that was found, or one that predicts what it was fitted to as well
-    and, by more than noise, what was kept back better."""
-    fitted, others = _named(search, found, found.fitted, log)
-    told = [other for each in others.values() for other, _ in each]
-    for tried in rivals.sets(found.equals, found.judge, fitted, told) if fitted.setting else ():
-        if check.prefers(tried.setting, fitted.setting):
-            log(f"  kept-back recordings prefer {', '.join(map(str, tried.setting))}")
-            fitted, others = _named(search, found, tried, log)
-    return fitted, others
-
-
-def _named(search, found, fitted, log):
-    """(Fitted, classes) of a set, each finding by the best member of its class."""
-    named, others = _classes(search, found, fitted, log, search.candidates)
-    if set(named.setting) != set(fitted.setting):  # what made up for another member goes
-        named = search.pruned(found.judge, named, found.judge.fit({}))
-    return changing(found.judge, named), others
 
 
 def _checked(search, found, fitted, others, log):
@@ -180,11 +152,15 @@ def _strain(candidate, values, prior):
     return f"{p.name} {values[k]:.3g} {p.unit}: {usual}"
 
 
-def _hand_over(search, checks, outcome, log):
+def _hand_over(search, held, kept_back, outcome, log):
     """Fill in the Handed, what of the findings kept-back recordings do not speak against, and how
     sure of each the judge is."""
     world, found = search.world, outcome.found
-    setting, judge, (check, decides) = outcome.fitted.setting, found.judge, checks
+    setting, noise = outcome.fitted.setting, found.smoother.position_noise
+    check = decides = Check(world, held, Smoother(world, held), noise)
+    if kept_back is not held:
+        decides = Check(world, kept_back, Smoother(world, kept_back), noise)
+    judge = found.judge
 
     pool = list(search.candidates)
 
@@ -210,5 +186,5 @@ def _hand_over(search, checks, outcome, log):
     check.locate(kept)
     outcome.held_check = check
     smoother = found.smoother
-    outcome.train_check = Check(world, smoother.recordings, smoother, smoother.position_noise)
+    outcome.train_check = Check(world, smoother.recordings, smoother, noise)
     outcome.train_check.trajectory = outcome.trajectory

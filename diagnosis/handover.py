@@ -114,12 +114,6 @@ class Check:
         are smoothed under it."""
         return np.array([self.error(files, w) for w in (self.windows, self.smoothed(setting))]) ** 2
 
-    def prefers(self, setting, other):
-        """Whether a setting predicts better than another by more than noise does, from start states
-        as recorded, and as they are smoothed under each."""
-        better, worse = (self.squares(Files.of(self.world, s), s) for s in (setting, other))
-        return _worse(worse, better) > self.scattered()
-
     def error(self, files, windows=None):
         """As errors(), of all channels; infinite where they do not run."""
         try:

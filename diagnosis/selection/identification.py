@@ -21,7 +21,6 @@ from diagnosis.selection.first_look import likely
 from diagnosis.selection.judge import Fitted, Judge, problem
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
-from diagnosis.selection.rivals import tied
 from diagnosis.selection.starts import Starts
 from diagnosis.selection.unmodelled_force import dependences
 
@@ -38,7 +37,7 @@ class Found:
     """What the search ended with: fitted, the Fitted set; trajectory and first, smoothed under it
     and under the nominal model; judge, on the windows begun at that trajectory; missing, the
     MissingForce of the last round; ranking: [(candidate, loss removed alone, p-value)], most
-    first; equals: [Fitted] sets that predict as well, as they were judged."""
+    first."""
 
     fitted: Fitted
     trajectory: object
@@ -48,7 +47,6 @@ class Found:
     judge: Judge
     missing: MissingForce
     ranking: list
-    equals: list
 
 
 class Identification:
@@ -57,7 +55,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen, self.missing, self.equals = {}, None, []
+        self.seen, self.missing = {}, None
         self.looked = 1.0  # how many different columns a round looks at
         self.candidates = [
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
@@ -89,8 +87,7 @@ class Identification:
             self.screen.start(trajectory, setting)
             judge = self.judge()
             fitted = judge.fit(setting)
-        some = smoother, self.usual, judge, self.missing, ranking, self.equals
-        return Found(fitted, trajectory, first, *some)
+        return Found(fitted, trajectory, first, smoother, self.usual, judge, self.missing, ranking)
 
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
@@ -133,8 +130,6 @@ class Identification:
                 judged.append(judge.fit(fitted.inside, steps=3))
         best = self._choose(judged, now)
         if best is not now:
-            others = [f for f in judged if f.settled and f is not best and self.earned(now, f)]
-            self.equals = [f for f in others if tied(f.score, best.score)]
             best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         better = best.setting.keys() != setting.keys()

@@ -39,8 +39,8 @@ def classes(candidates, judge, missing, fitted, begun, log=lambda what: None):
         if own is not candidate:
             log(f"  better in its class: {candidate} -> {own}")
             swapped = True
-        equal = [(f, o) for f, o in members if tied(f.score, fitted.score)]
-        others[own] = [(o, f.setting[o]) for f, o in equal if o is not own]
+        tied = [(f, o) for f, o in members if _tied(f.score, fitted.score)]
+        others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
         told = {o for o, _ in others[own]}
         pool = [c for c in candidates if c not in told and c not in fitted.setting]
         others[own] += _late(pool, begun, missing.chain.world, fitted, own)
@@ -57,11 +57,11 @@ def _members(candidates, judge, before, fitted, candidate):
     near = _alike(judge, missing, fitted, candidate, pool)
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
-        if not tried.settled or not (tied(tried.score, fitted.score) or tried.loss < fitted.loss):
+        if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
             continue
         tried = judge.fit(tried.setting)  # forces tell values better than the motion
         lacks = missing.scores(tried.setting, fitted.setting)
-        if lacks is None or tied(*lacks):
+        if lacks is None or _tied(*lacks):
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
@@ -79,28 +79,12 @@ def _late(pool, begun, world, fitted, candidate):
     for other in near:
         held = {**rest, other: fitted.setting[candidate]}
         tried = begun(held).fit(held)
-        if tried.settled and tied(tried.score, fitted.score):
+        if tried.settled and _tied(tried.score, fitted.score):
             out.append((other, tried.setting[other]))
     return out
 
 
-def sets(judged, judge, fitted, told):
-    """Of Fitted sets that were judged, those that predict as well as another one, refitted, the
-    simplest first: of other effects than its own and those told in their places."""
-    physics = lambda setting: {c for c in setting if not c.effect.numerical}
-    mine, most, out = physics(fitted.setting), complexity(fitted.setting) + FURTHER, []
-    step = {c: v for c, v in fitted.setting.items() if c not in mine}
-    for other in sorted(judged, key=lambda f: complexity(f.setting)):
-        names = physics(other.setting)
-        if names <= {*mine, *told} or names >= mine:
-            continue
-        tried = judge.fit({**other.setting, **step})
-        if tried.settled and complexity(tried.setting) <= most and tied(tried.score, fitted.score):
-            out.append(tried)
-    return out
-
-
-def tied(tried, fitted):
+def _tied(tried, fitted):
     """Whether a Score is as good as another one, or worse by no more than chance."""
     worse = paired(tried, fitted)
     return worse.gain < TIED or worse.p_value > CHANCE

@@ -32,16 +32,6 @@ def test_a_finding_that_predicts_worse_is_not_handed_over(kept_back):
     assert check.error(handed.files) < handed.without[damping]
 
 
-def test_what_predicts_kept_back_recordings_better_by_more_than_noise_is_preferred(kept_back):
-    world, check = kept_back
-    damping, spring = (
-        world.candidate(*c) for c in (("viscous_damping", "pivot"), ("stiffness", "pivot"))
-    )
-    true, near, wrong = {damping: (0.1,)}, {damping: (0.1001,)}, {damping: (0.1,), spring: (0.5,)}
-    assert check.prefers(true, wrong) and not check.prefers(wrong, true)
-    assert not check.prefers(true, near) and not check.prefers(near, true)
-
-
 def test_findings_that_do_harm_together_all_go(kept_back):
     world, check = kept_back
     wrong = {world.candidate("bias", "drive"): (0.3,), world.candidate("gain", "drive"): (1.5,)}

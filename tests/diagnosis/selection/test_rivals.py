@@ -66,37 +66,3 @@ def test_the_best_for_its_price_stands_and_what_predicts_as_well_is_told(
 ):
     found, told = chosen(monkeypatch, fitted, losses)
     assert found == [name] and told[name] == others
-
-
-@pytest.mark.parametrize(
-    "names, worse, told, equal",
-    [
-        ("ab", 0.0, "", True),
-        ("ab", 0.5, "", False),  # predicts worse
-        ("ab", 0.0, "ab", False),  # in the class already
-        ("ab", 0.0, "a", True),
-        ("xa", 0.0, "", False),  # the set that was found, and more
-        ("abcde", 0.0, "", False),  # much more complex
-        ("t", 0.0, "", False),  # a time step is no physics
-    ],
-)
-def test_sets_that_predict_as_well_are_of_other_effects_and_hardly_more_complex(
-    names, worse, told, equal
-):
-    every = {n: Named(n, 1) for n in "xabcde"}
-    every["t"] = Named("t", 0)
-    every["t"].effect.numerical = True
-    step = {every["t"]: (0.001,)}
-
-    class Judge:
-        def fit(self, setting):
-            lost = 0.0 if every["x"] in setting and len(setting) == 2 else worse
-            groups = lost + np.linspace(0, 1e-3, 4)
-            score = Score(lost, groups, 4 * groups, ())
-            return SimpleNamespace(setting=setting, score=score, settled=True)
-
-    found = Judge().fit({every["x"]: (2.0,), **step})
-    judged = [SimpleNamespace(setting={every[n]: (1.0,) for n in names})]
-    sets = rivals.sets(judged, Judge(), found, [every[n] for n in told])
-    assert [set(s.setting) - set(step) for s in sets] == equal * [{every[n] for n in names}]
-    assert all(set(step) <= set(s.setting) for s in sets)  # as the one that was found has it
