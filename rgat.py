@@ -11,6 +11,7 @@ of the paper is one class with the same two steps.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -21,6 +22,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch
 
+from diagnosis.simulation.corrected_py import CorrectedBatch, parts_in
 from envs import BatchEnv, EnvError
 from models import (
     ForwardModel,
@@ -403,9 +405,8 @@ class Solver(Grounding):
 
     def __init__(self, sim, settings=GroundingSettings()):
         super().__init__(sim, settings)
-        nthread = sim.batch.nthread
-        self.probe = Batch(sim.model, sim.num_envs * (1 + self.nact), nthread)
-        self.trial = Batch(sim.model, sim.num_envs * 2, nthread)
+        self.probe = batch_of(sim, sim.num_envs * (1 + self.nact))
+        self.trial = batch_of(sim, sim.num_envs * 2)
 
     def _target(self, action):
         """Where one step under action (n, nact) should end: (n, 1, nobs), in units of scale."""
@@ -417,6 +418,8 @@ class Solver(Grounding):
         Returns observations (n, k, nobs), in units of scale."""
         n, k, _ = actions.shape
         batch.state[:] = np.repeat(self.sim.batch.state, k, axis=0)
+        if isinstance(batch, CorrectedBatch):
+            batch.recall(self.sim.batch, k)
         batch.ctrl = actions.reshape(n * k, -1)
         batch.step(nstep=self.sim.task.frame_skip)
         return self.sim.task.observe(batch.qpos, batch.qvel).reshape(n, k, -1) / self.scale
@@ -543,6 +546,39 @@ METHODS = {
 }
 
 
+def batch_of(env, nsim):
+    """A Batch of so many simulations of a BatchEnv's world."""
+    parts = getattr(env, "parts", ())
+    kind = partial(CorrectedBatch, parts=parts) if parts else Batch
+    return kind(env.model, nsim, env.batch.nthread)
+
+
+class CorrectedEnv(BatchEnv):
+    """The task in the world that a diagnosis hands over: its corrected.xml, and what its
+    corrected.py adds to every step.
+
+    xml, script: the texts; an empty script adds nothing. Raises EnvError for a model with other
+    joints than the task's.
+    """
+
+    def __init__(self, env_id, num_envs, xml, script="", nthread=0):
+        model = mujoco.MjModel.from_xml_string(xml)
+        super().__init__(env_id, num_envs, model=model, nthread=nthread)
+        self.parts = parts_in(script)
+        if self.parts:
+            self.batch = batch_of(self, num_envs)
+            self.qpos, self.qvel, ctrl = map(self.batch.bind, ("qpos", "qvel", "ctrl"))
+            self._ctrl = ctrl[:, : self._ctrl.shape[1]]
+            self.task.place(self)
+
+    def peek(self, actions):
+        """As BatchEnv.peek, with what has reached the drives so far."""
+        if self.parts:
+            self._peek = self._peek or batch_of(self, self.num_envs)
+            self._peek.recall(self.batch)
+        return super().peek(actions)
+
+
 def grounded_env(run, num_envs=1, step=None):
     """The grounded simulator of a finished run, RGAT's product: a gymnasium vector environment to
     train any policy in.
@@ -555,9 +591,12 @@ def grounded_env(run, num_envs=1, step=None):
         raise EnvError(f"{run} has no grounding step {step or 1}: it has done {len(steps)}")
     saved = load_checkpoint(steps[-1 if step is None else step - 1])
     world, state = saved["world"], saved["grounding"]
-    xml, state = state.get("corrected_xml"), state.get("rest", state)
-    model = mujoco.MjModel.from_xml_string(xml) if xml else None
-    sim = BatchEnv(world["env"], num_envs, model=model)
+    xml, script = state.get("corrected_xml"), state.get("corrected_py", "")
+    if xml:
+        sim = CorrectedEnv(world["env"], num_envs, xml, script)
+    else:
+        sim = BatchEnv(world["env"], num_envs)
+    state = state.get("rest", state)
     method = METHODS.get(world["algo"].removeprefix("physics+"), Grounding)
     if method is Oracle:
         raise EnvError(f"{run}: an oracle's simulator cannot be had without the real one")

@@ -1,17 +1,16 @@
 """Grounding by diagnosis: not actions are transformed, but missing physics is put into the sim.
 
 The real trajectories become recordings, diagnose() finds what they show to be missing, and its
-corrected model becomes the world in which the policy improves. It sees what the other methods see:
-observations and actions.
+corrected model, with the forces of its script, becomes the world in which the policy improves. It
+sees what the other methods see: observations and actions.
 """
 
-import mujoco
 import numpy as np
 
 from diagnosis.command import ModelError, diagnose
 from diagnosis.recordings.recording import Recording, RecordingError
-from envs import BatchEnv, EnvError, model_path
-from rgat import Grounding, GroundingSettings, identity, one_step_error
+from envs import EnvError, model_path
+from rgat import CorrectedEnv, Grounding, GroundingSettings, identity, one_step_error
 
 
 class Physics(Grounding):
@@ -22,7 +21,7 @@ class Physics(Grounding):
 
     def __init__(self, sim, settings=GroundingSettings()):
         super().__init__(sim, settings)
-        self.nominal, self.xml = sim, ""
+        self.nominal, self.xml, self.script = sim, "", ""
 
     def fit(self, tau_real, seed):
         """Line 3: the raw simulator with the physics that all recordings so far show to be missing.
@@ -36,13 +35,14 @@ class Physics(Grounding):
         except (RecordingError, ModelError) as error:
             raise EnvError(f"no diagnosis from {len(tau_real)} real transitions: {error}") from None
 
-        def error(xml):
+        def error(files):
             try:
-                return one_step_error(self._simulator(xml), identity, tau_real)[0]
-            except EnvError:
+                return one_step_error(self._simulator(*files), identity, tau_real)[0]
+            except ValueError:  # EnvError, or what a batch does not tell a script
                 return np.inf
 
-        self.xml = min((diagnosis.corrected_xml, self.xml), key=error)
+        found = diagnosis.corrected_xml, diagnosis.corrected_py
+        self.xml, self.script = min(found, (self.xml, self.script), key=error)
         return {}
 
     def update(self, policy, steps, seed, on_update=None):
@@ -51,25 +51,21 @@ class Physics(Grounding):
         return {}
 
     def _rebuild(self):
-        self.sim, self.transformer = self._simulator(self.xml), identity
+        self.sim, self.transformer = self._simulator(self.xml, self.script), identity
 
-    def _simulator(self, xml):
-        """The task in the world of an MJCF, or in the raw simulator's if there is none yet."""
+    def _simulator(self, xml, script):
+        """The task in the world of an MJCF and a script's forces, or in the raw simulator's if
+        there is none yet."""
+        raw = self.nominal
         if not xml:
-            return self.nominal
-        model = mujoco.MjModel.from_xml_string(xml)
-        return BatchEnv(
-            self.nominal.env_id,
-            self.nominal.num_envs,
-            model=model,
-            nthread=self.nominal.batch.nthread,
-        )
+            return raw
+        return CorrectedEnv(raw.env_id, raw.num_envs, xml, script, raw.batch.nthread)
 
     def state(self):
-        return {"corrected_xml": self.xml}
+        return {"corrected_xml": self.xml, "corrected_py": self.script}
 
     def load(self, state):
-        self.xml = state["corrected_xml"]
+        self.xml, self.script = state["corrected_xml"], state["corrected_py"]
         self._rebuild()
 
 

@@ -2,7 +2,7 @@
 mujoco alone.
 
     parts = python_parts(world.model, setting)      # [] where corrected.xml alone holds it
-    write_corrected_py("report/corrected.py", "report/corrected.xml", parts, joints)
+    text = corrected_py(parts, joints)              # of report/corrected.py, say
     rows = predictions("report/corrected.py", windows, world.model)  # in a process of its own
     step = module_of(parts, joints).step            # step(model, data, nstep) in this process
     batch = CorrectedBatch(model, 64, parts=parts)  # many environments at once, for training
@@ -25,7 +25,6 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from diagnosis.common.atomic_files import write_whole
 from diagnosis.effects import EFFECTS
 from diagnosis.effects.base import Part
 from diagnosis.simulation import corrected_template
@@ -57,12 +56,6 @@ def python_parts(model, setting, written=None):
             parts += [part] if isinstance(part, Part) else list(part or ())
     late = {"delay": 1, "lag": 2}  # of what the others leave
     return sorted(parts, key=lambda part: late.get(part.law, 0))
-
-
-def xml_holds(written):
-    """Whether corrected.xml alone holds a setting: written as World.corrected_xml told,
-    {Candidate: form}."""
-    return all(form != "python" for form in written.values())
 
 
 def corrected_py(parts, joints, xml_name="corrected.xml"):
@@ -126,12 +119,6 @@ def _pruned(source, replaced):
             blocks.remove(block)
     out = [line for block in blocks for line in (*block[1], block[2])]
     return "\n".join(out) + "\n"
-
-
-def write_corrected_py(path, xml_path, parts, joints):
-    """Write the script for Parts to path, for the MJCF at xml_path in the same folder. Raises
-    WriteError."""
-    write_whole(path, corrected_py(parts, joints, Path(xml_path).name))
 
 
 RUNNER = """
@@ -265,10 +252,19 @@ class CorrectedBatch(Batch):
 
     def __init__(self, model, nsim, nthread=0, parts=()):
         super().__init__(model, nsim, nthread)
-        self._parts, self._memory = list(parts), {}
+        self._parts, self.memory = list(parts), {}  # of the laws of control
         self._script = module_of(self._parts)
         dry = any(part.law in self._script.FRICTION for part in self._parts)
         self._loss = self.expand("dof_frictionloss") if dry else None
+
+    def recall(self, batch, times=1):
+        """Take over what has reached the drives of another batch, of each of its simulations so
+        many times."""
+        repeated = lambda x: np.repeat(x, times) if np.ndim(x) else x
+        self.memory = {
+            part: {law: tuple(map(repeated, kept)) for law, kept in laws.items()}
+            for part, laws in batch.memory.items()
+        }
 
     def step(self, ids=None, nstep=1, stage=0):
         """As Batch.step, with the corrections worked out at the beginning of each step."""
@@ -279,7 +275,7 @@ class CorrectedBatch(Batch):
         wanted, before = ctrl.copy(), pushed.copy()
         for k in range(nstep):
             look = BatchLook(self)
-            ctrl[:] = self._script.controls(self.model, look, wanted, self._memory)
+            ctrl[:] = self._script.controls(self.model, look, wanted, self.memory)
             if self._loss is not None:
                 self._loss[:] = self.model.dof_frictionloss
             self.forward(ids)

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from diagnosis.simulation.corrected_py import (
+    corrected_py,
+    module_of,
+    parts_in,
+    python_parts,
+)
+from diagnosis.simulation.simulator import World
 from envs import BatchEnv, EnvError, model_path, parse_perturbation
 from models import GaussianPolicy
-from rgat import RGAT, GroundingSettings, Solved, identity, one_step_error
+from rgat import RGAT, CorrectedEnv, GroundingSettings, Solved, identity, one_step_error
 from training.physics_grounding import Physics, PhysicsThen, recordings_of
 from trpo import Transitions, TRPOConfig, rollouts
 
@@ -76,12 +83,94 @@ def test_a_diagnosis_that_predicts_worse_than_the_last_is_not_taken(monkeypatch)
     for mass, joints, kept in ((12, 0, 12), (100, 0, 12), (20, 1, 12), (20, 0, 20)):
         monkeypatch.setattr(
             "training.physics_grounding.diagnose",
-            lambda path, recordings: SimpleNamespace(corrected_xml=with_pole(mass, joints)),
+            lambda path, recordings: SimpleNamespace(
+                corrected_xml=with_pole(mass, joints), corrected_py=""
+            ),
         )
         grounding.fit(tau, 0)
         assert mujoco.MjModel.from_xml_string(grounding.xml).body("pole").mass[0] == pytest.approx(
             kept
         )
+
+
+def scripted(**effects):
+    """(xml, script) of the pendulum with effects of its drive, as a diagnosis hands them over."""
+    world = World.load(model_path("InvertedPendulum-v4"))
+    setting = {world.candidate(name, "slide"): values for name, values in effects.items()}
+    xml, written = world.corrected_xml(setting)
+    parts = python_parts(world.model, setting, written)
+    return xml, corrected_py(parts, ["slider", "hinge"])
+
+
+SLOW = {"rate_limit": (30.0,), "torque_speed": (2.0, 250.0)}  # a memory, and a force
+
+
+def begun(env, i):
+    """MjData where the i-th of the environments is."""
+    data = mujoco.MjData(env.model)
+    data.qpos[:], data.qvel[:] = env.qpos[i], env.qvel[i]
+    return data
+
+
+def test_the_world_of_a_script_moves_as_the_script_does():
+    xml, script = scripted(**SLOW)
+    env = CorrectedEnv("InvertedPendulum-v4", 3, xml, script, nthread=1)
+    plain = CorrectedEnv("InvertedPendulum-v4", 3, xml, nthread=1)
+    step = module_of(parts_in(script)).step
+    rng, apart, ended = np.random.default_rng(0), 0.0, 0
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    alone = [begun(env, i) for i in range(3)]
+    for _ in range(12):
+        a = rng.uniform(-3, 3, (3, 1)).astype(np.float32)
+        seen = env.peek(a)
+        np.testing.assert_array_equal(seen, env.peek(a))  # nothing moves
+        _, _, fell, _, info = env.step(a)
+        np.testing.assert_allclose(seen, info["next_obs"], atol=1e-12)
+        for data, u in zip(alone, a):
+            data.ctrl[:] = u
+            step(env.model, data, env.frame_skip)
+        expected = [np.concatenate([data.qpos, data.qvel]) for data in alone]
+        np.testing.assert_allclose(info["next_obs"], expected, atol=1e-9)
+        # one that fell begins anew, with nothing in memory
+        alone = [begun(env, i) if fell[i] else data for i, data in enumerate(alone)]
+        ended += fell.sum()
+        apart = max(apart, abs(plain.step(a)[-1]["next_obs"] - info["next_obs"]).max())
+    assert ended
+    assert apart > 1e-3
+
+
+def test_the_script_of_a_diagnosis_is_in_the_simulator(monkeypatch):
+    """Real is a drive that no MJCF holds: with the script nothing is missing, without it much is."""
+    force = {"torque_speed": SLOW["torque_speed"]}  # one step tells nothing of a memory
+    files = scripted(**force)
+    monkeypatch.setattr(
+        "training.physics_grounding.diagnose",
+        lambda path, recordings: SimpleNamespace(corrected_xml=files[0], corrected_py=files[1]),
+    )
+    sim = BatchEnv("InvertedPendulum-v4", 4, nthread=1)
+    tau = transitions(CorrectedEnv("InvertedPendulum-v4", 4, *files, nthread=1), 4)
+    grounding = Physics(sim)
+    grounding.fit(tau, 0)
+    grounding.update(None, 0, 0)
+    assert (grounding.xml, grounding.script) == files
+    assert one_step_error(grounding.sim, identity, tau)[0] < 1e-5
+    assert one_step_error(sim, identity, tau)[0] > 1e-3
+    again = Physics(sim)
+    again.load(grounding.state())
+    assert again.sim.parts == grounding.sim.parts != []
+
+
+def test_a_solver_probes_the_world_of_the_script():
+    env = CorrectedEnv("InvertedPendulum-v4", 3, *scripted(**SLOW), nthread=1)
+    solver, rng = Solved(env), np.random.default_rng(1)
+    solver.scale = np.ones(4)
+    env.reset(seed=0)
+    for k in range(4):
+        a = rng.uniform(-2, 2, (3, 1)).astype(np.float32)
+        tried = np.stack([a, -a] if k % 2 else [-a, a], 1)
+        probed = solver._after(solver.trial, tried)[:, (k + 1) % 2]
+        np.testing.assert_allclose(probed, env.step(a)[-1]["next_obs"], atol=1e-12)
 
 
 def with_pole(mass, joints):
@@ -115,7 +204,9 @@ def test_a_transformer_takes_what_the_diagnosis_leaves(rest, monkeypatch):
     for mass in (12, 13):
         monkeypatch.setattr(
             "training.physics_grounding.diagnose",
-            lambda path, recordings: SimpleNamespace(corrected_xml=with_pole(mass, 0)),
+            lambda path, recordings: SimpleNamespace(
+                corrected_xml=with_pole(mass, 0), corrected_py=""
+            ),
         )
         before = getattr(grounding.rest, "learner", None)
         before = before and [p.detach().clone() for p in before.policy.net.parameters()]
