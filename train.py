@@ -424,24 +424,17 @@ class Parser(argparse.ArgumentParser):
         raise RunError(f"{message}; see --help")
 
 
-def parse(argv):
-    """The parsed command line; raises RunError where it makes no sense."""
+def arguments():
+    """The Parser of the command line: every Setting, and what to do with a run."""
     parser = Parser(
         prog="train.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     for f in dataclasses.fields(Settings):
-        shown = (
-            ""
-            if f.default in (None, "") or "(default:" in f.metadata["help"]
-            else f" (default: {f.default})"
-        )
-        extra = {k: v for k, v in f.metadata.items() if k != "help"}
+        words = dict(f.metadata)
+        if f.default not in (None, "") and "(default:" not in words["help"]:
+            words["help"] += f" (default: {f.default})"
         parser.add_argument(
-            f"--{f.name.replace('_', '-')}",
-            type=kind_of(f),
-            default=f.default,
-            help=f.metadata["help"] + shown,
-            **extra,
+            f"--{f.name.replace('_', '-')}", type=kind_of(f), default=f.default, **words
         )
     parser.add_argument("--out", help="folder of the run (default: runs/ENV-ALGO-sSEED)")
     parser.add_argument(
@@ -459,10 +452,14 @@ def parse(argv):
         action="store_true",
         help="write TensorBoard's scalars into the run's folder too",
     )
-    args = parser.parse_args(argv)
-    given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default] + [
-        "out"
-    ] * (args.out is not None)
+    return parser
+
+
+def parse(argv):
+    """The parsed command line; raises RunError where it makes no sense."""
+    args = arguments().parse_args(argv)
+    given = [f.name for f in dataclasses.fields(Settings) if getattr(args, f.name) != f.default]
+    given += ["out"] * (args.out is not None)
     if args.resume:
         given = [name for name in given if name != "grounding_steps"]
     if given and (args.resume or args.replay):

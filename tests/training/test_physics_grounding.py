@@ -141,7 +141,7 @@ def test_the_world_of_a_script_moves_as_the_script_does():
 
 
 def test_the_script_of_a_diagnosis_is_in_the_simulator(monkeypatch):
-    """Real is a drive that no MJCF holds: with the script nothing is missing, without it much is."""
+    """Real is a drive that no MJCF holds: with the script nothing is missing, without it much."""
     force = {"torque_speed": SLOW["torque_speed"]}  # one step tells nothing of a memory
     files = scripted(**force)
     monkeypatch.setattr(
