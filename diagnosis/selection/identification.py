@@ -160,7 +160,8 @@ class Identification:
                 continue
             options = beam.columns.options
             added = [options[k].candidate for k in node.options[len(start.options) :]]
-            # curves of one joint are one explanation of its force
+            # a finer step is no other explanation, and curves of one joint's force are one
+            added = [c for c in added if not c.effect.numerical] or added
             names = {c.place if isinstance(c.effect, Unknown) else c for c in added}
             same = [abs(node.score.groups - c.score.groups).max() < LEAST for c in chosen]
             if not any(same) and not any(names >= better for better in seen):

@@ -165,6 +165,17 @@ def test_finalists_are_worth_their_price_or_no_chance_and_predict_differently(se
     assert finalists[3:] == [same, luck]  # simple sets are judged whatever columns tell of them
 
 
+def test_a_finer_step_makes_no_other_explanation_of_a_set(search):
+    noise, step = 1e-3 * np.arange(16), search.world.candidate("time_step", "world")
+    named = [*search.world.candidates[:4], step]
+    effects = [SimpleNamespace(candidate=candidate) for candidate in named]
+    beam = SimpleNamespace(columns=SimpleNamespace(options=effects))
+    finer, plain = node(noise - 0.6, 0.2, 0, 1, 4), node(noise - 0.5, 0.2, 0, 1)
+    other, alone = node(noise - 0.4, 0.2, 2, 3), node(noise - 0.3, 0.1, 4)
+    finalists = search._finalists(beam, node(noise, 0.0), [finer, plain, other, alone])
+    assert finalists == [finer, other, alone]
+
+
 def test_what_became_nominal_is_no_finding(search):
     friction, stiffness = (
         search.world.candidate(name, "elbow") for name in ("coulomb_friction", "stiffness")
