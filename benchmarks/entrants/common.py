@@ -3,11 +3,9 @@
 Nothing here is the diagnosis' own: an entrant is what a user would write with other tools.
 """
 
-import argparse
 import csv
 import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -24,18 +22,6 @@ class Recording:
     time: np.ndarray
     qpos: np.ndarray
     ctrl: np.ndarray
-
-
-def words(what, **first):
-    """The command line MODEL RECORDINGS… OUT as a namespace, behind a word of its own where one is
-    given: its name, and the options of add_argument."""
-    parser = argparse.ArgumentParser(description=what)
-    for name, options in first.items():
-        parser.add_argument(name, **options)
-    parser.add_argument("model", type=Path, help="the simulator, MJCF")
-    parser.add_argument("recordings", type=Path, nargs="+", help="CSV files of the contract")
-    parser.add_argument("out", type=Path, help="folder for diagnosis.json and what corrects")
-    return parser.parse_args()
 
 
 def opened(args):

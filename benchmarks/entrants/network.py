@@ -17,7 +17,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from common import opened, states, words, write  # noqa: E402
+from command_line import words  # noqa: E402
+from common import opened, states, write  # noqa: E402
 
 WIDTH, EPOCHS, RATE, DECAY = 48, 300, 3e-3, 1e-4
 

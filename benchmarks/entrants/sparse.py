@@ -15,7 +15,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from common import finding, opened, states, words, write  # noqa: E402
+from command_line import words  # noqa: E402
+from common import finding, opened, states, write  # noqa: E402
 from fields import fields  # noqa: E402
 
 SHARE = 0.05  # of the joint's force, below which a term is dropped

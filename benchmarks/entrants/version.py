@@ -5,13 +5,16 @@
 The commit is unpacked once into a folder of the system's temporary files.
 """
 
-import argparse
 import os
 import subprocess
 import sys
 import tarfile
 import tempfile
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from command_line import words  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -35,12 +38,7 @@ def unpacked(commit):
 
 def main():
     """Run that version's diagnose.py in place of this process."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("commit", help="of this repository")
-    parser.add_argument("model", help="the simulator, MJCF")
-    parser.add_argument("recordings", nargs="+", help="CSV files of the contract")
-    parser.add_argument("out", help="folder for the report")
-    args = parser.parse_args()
+    args = words(main.__doc__, commit={"help": "of this repository"})
     script = unpacked(args.commit) / "diagnose.py"
     line = [script, "--model", args.model, "--recordings", *args.recordings, "--out", args.out]
     os.execv(sys.executable, [sys.executable, *map(str, line)])

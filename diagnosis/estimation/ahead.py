@@ -64,7 +64,7 @@ class Ahead:
         self.qpos, self.qvel = windowing.recorded_starts(self.model, windows)
         self.spread = np.zeros((len(windows), 2 * self.model.nv))  # of start states
         self.base, self._freedom = {}, None
-        self.coarse = {}  # {time_step: seconds} of what is a difference, where it is another
+        self.coarse = {}  # {time_step: seconds} for columns; empty: the simulator's own
 
     def _travel(self):
         start = self.measured[:, :1]

@@ -38,7 +38,8 @@ class Chain(Ahead):
         self.rows = first[:, None] + np.minimum(ahead, last[:, None])
         follows = ahead[:-1] < last[:, None]
         self.begin = np.unique(self.rows[:, :-1][follows])
-        self.whole = self._begun(self.windows)
+        touching = coarse(self.world, trajectory.first, touching=True)
+        self.whole = self._begun(self.windows, touching)
         self.carried, touched = follows, (trajectory.free[self.rows[:, :-1]] & follows).any(1)
         with np.errstate(over="ignore", invalid="ignore"):
             near = abs(self._carried_starts()) < ASTRAY * self.whole.travel[:, None]
@@ -52,9 +53,7 @@ class Chain(Ahead):
         self.coarse, self.base = coarse(self.world, trajectory.first), self.plain(self.base)
         rough = self._rows({**self.coarse, **self.base}, self.begin)
         self.finer, self.beyond = self._rows({**step, **self.base}, self.begin) - rough, {}
-        self.contacts = self._begun([self.windows[i] for i in self.touched])
-        for part in filter(None, (self.whole, self.contacts)):
-            part.coarse = coarse(self.world, trajectory.first, touching=True)
+        self.contacts = self._begun([self.windows[i] for i in self.touched], touching)
         self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
 
     def beginnings(self, number, seconds):
@@ -66,10 +65,12 @@ class Chain(Ahead):
         short.beyond = self.glances.setdefault((number, seconds), {})
         return short
 
-    def _begun(self, windows):
+    def _begun(self, windows, step):
+        """An Ahead of windows, with a time step for columns; None of no windows."""
         if not windows:
             return None
         ahead = Ahead(self.world, windows, self.noise)
+        ahead.coarse = step
         ahead.start(self.trajectory, self.base)
         return ahead
 

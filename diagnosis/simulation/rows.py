@@ -23,7 +23,7 @@ SMALL = 1e-6, 1e-5, 1e-3  # steps of the forward differences: rad or m, per seco
 
 def coarse(world, recordings, touching=False):
     """{time_step: seconds}: a few steps in a row, for what is a difference of two simulations.
-    touching: that something touches in."""
+    touching: short enough for contacts and limits too."""
     own = world.model.opt.timestep
     seconds = np.median(np.concatenate([np.diff(r.time) for r in recordings])) / STEPS
     seconds = min(seconds, SWING / max(_fastest(world.model, touching), 1e-9))
@@ -32,8 +32,8 @@ def coarse(world, recordings, touching=False):
 
 
 def _fastest(model, touching):
-    """The highest rate, 1/s, at which a joint's springs, dampers and servos act on its inertia, and
-    what touches gives way."""
+    """The highest rate, 1/s, at which a joint's springs, dampers and servos act on its inertia, or,
+    where something is touching, a contact or a limit gives way."""
     stiff, slow = np.zeros(model.nv), model.dof_damping.copy()
     for j in range(model.njnt):
         stiff[model.jnt_dofadr[j]] = model.jnt_stiffness[j]
@@ -51,8 +51,8 @@ def _fastest(model, touching):
 
 
 def _contact_rates(solref):
-    """Of contacts or limits (n, 2), as MuJoCo's solref has them: a time constant and a damping
-    ratio, or stiffness and damping, negative."""
+    """Rates (n,), 1/s, at which contacts or limits give way. solref (n, 2), MuJoCo's: a time
+    constant and a damping ratio, or stiffness and damping with a minus."""
     first, second = solref.T
     direct = np.maximum(np.sqrt(np.maximum(-first, 0.0)), -second)
     return np.where(first < 0, direct, 1 / np.maximum(first * np.maximum(second, 1), 1e-9))
