@@ -62,7 +62,8 @@ class Parameter:
 class Candidate:
     """An effect at a place, perhaps only under a condition. Hashable; equal if these are.
 
-    when: None, or {'recording': name, 'time': [from, to]}, in that recording's time.
+    when: None, or {'recording': name, 'time': [from, to]}, in that recording's time; name None: in
+    that of each.
     """
 
     effect: "Effect"

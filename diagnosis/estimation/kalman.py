@@ -26,12 +26,13 @@ class Smoothed:
     likelihood: float
 
 
-def smooth(A, c, Q, y, R, start, spread):
+def smooth(A, c, Q, y, R, start, spread, counts=None):
     """Smooth all blocks.
 
     A (T, b, n, n), c (T, b, n): from row t to t + 1; Q (T, b, n): variances of its noise. y (T, b,
     m): the first m components as measured, NaN where not; R (m,). start (b, n), spread (b, n): mean
-    and variances before the first row. The last row's A, c and Q are not used.
+    and variances before the first row. The last row's A, c and Q are not used. counts (T, b): the
+    rows that tell R's scores, by default all.
     """
     T, b, n = c.shape
     m = y.shape[-1]
@@ -52,8 +53,9 @@ def smooth(A, c, Q, y, R, start, spread):
         Kt = K.transpose(0, 2, 1)
         u = ((Finv @ error[t][..., None]) - Kt @ r[..., None])[..., 0]
         D = np.einsum("bii->bi", Finv) + (Kt @ N * Kt).sum(-1)
-        measurement[0] += (u**2 * k).sum(0)
-        measurement[1] += (D * k).sum(0)
+        told = k if counts is None else k & counts[t][:, None]
+        measurement[0] += (u**2 * told).sum(0)
+        measurement[1] += (D * told).sum(0)
         # r before the measurement: H' F^-1 v + (I - K H)' r
         keep = np.tile(np.eye(n), (b, 1, 1))
         keep[:, :, :m] -= K

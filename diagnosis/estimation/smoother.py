@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from diagnosis.effects.base import HINGE, SLIDE
 from diagnosis.effects.environment import touchable
 from diagnosis.estimation import windowing
 from diagnosis.estimation.kalman import smooth
@@ -24,8 +25,8 @@ from diagnosis.simulation.rows import RowMap
 
 BLOCK = 200  # rows that are smoothed as one piece
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
+NEAR = 2  # rows before and after what touches, whose errors tell no noise
 MOST = 10.0  # factor of a variance in one update
-LOUDER = 20.0  # noise is at most so many times what differences of readings show
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
 
 
@@ -165,11 +166,12 @@ class Smoother:
         seen = self._seen(off)
         for _ in range(passes):
             free = self._touching(qpos)
+            apart = self._apart(qpos, free)
             step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
             for _ in range(UPDATES):
-                found = self._smooth(step, qpos, qvel, seen)
-                self._update(found)
-            found = self._smooth(step, qpos, qvel, seen)
+                found = self._smooth(step, qpos, qvel, seen, apart)
+                self._update(found, apart)
+            found = self._smooth(step, qpos, qvel, seen, apart)
             nv, live = self.model.nv, self.live
             state, deviation = (np.empty((len(qpos), 3 * nv)) for _ in range(2))
             state[self.index[live]], deviation[self.index[live]] = (
@@ -208,6 +210,19 @@ class Smoother:
             touch[row] = data.ncon > 0
         return touch | np.append(touch[1:], False)
 
+    def _apart(self, qpos, free):
+        """Rows (N,) apart from what touches, ends of travel too: what a model errs there is no
+        noise."""
+        model = self.model
+        ends = [
+            j
+            for j in range(model.njnt)
+            if model.jnt_limited[j] and model.jnt_type[j] in (HINGE, SLIDE)
+        ]
+        at, (low, high) = qpos[:, model.jnt_qposadr[ends]], model.jnt_range[ends].T
+        touch = free | ((at < low) | (at > high)).any(1)
+        return np.convolve(touch, np.ones(2 * NEAR + 1), "same") == 0
+
     def _linear(self, rows, qpos, qvel, force, free, like=None):
         """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a
         trajectory, or of another one like it; extra velocity variance."""
@@ -239,7 +254,7 @@ class Smoother:
         whole[:, 2 * nv :, 2 * nv :] = np.eye(nv)
         return whole, np.concatenate([drift, np.zeros((n, nv))], 1), extra, rows.seconds
 
-    def _smooth(self, step, qpos, qvel, seen):
+    def _smooth(self, step, qpos, qvel, seen, apart):
         A, c, extra, seconds = step
         nv, (T, b) = self.model.nv, self.index.shape
         follows = self.live & ~self.last[self.index]
@@ -266,16 +281,18 @@ class Smoother:
                 self.scale**2,
             ]
         )
-        return smooth(transition, drift, noise, y, self.R, start, np.tile(spread, (b, 1)))
+        spread = np.tile(spread, (b, 1))
+        return smooth(transition, drift, noise, y, self.R, start, spread, apart[self.index])
 
-    def _update(self, found):
-        """Move every variance to where its score is nearer to zero."""
+    def _update(self, found, apart):
+        """Move every variance to where its score is nearer to zero. Of the noise, rows apart from
+        what touches tell that; the others count as if they showed the floor."""
         nv = self.model.nv
         ratio = lambda pair: np.clip(pair[0] / np.maximum(pair[1], 1e-300), 1 / MOST, MOST)
         self.walk = np.maximum(self.walk * ratio(found.process)[2 * nv :], 1e-12 * self.scale**2)
         known = found.measurement[1] > 0
-        moved = np.clip(self.R * ratio(found.measurement), self.floor, LOUDER**2 * self.floor)
-        self.R = np.where(known, moved, self.R)
+        moved = apart.mean() * self.R * ratio(found.measurement) + (~apart).mean() * self.floor
+        self.R = np.where(known, np.maximum(moved, self.floor), self.R)
 
 
 def _measured_velocity(model, recording):

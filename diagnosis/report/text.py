@@ -181,7 +181,10 @@ def when_words(when: dict | None) -> str:
         decimals = max(
             0, 2 - math.floor(math.log10(max(end - begin, 1e-6)))
         )  # not so many digits: the clock may count from 1970
-        return f", in {when['recording']} from {begin:.{decimals}f} to {end:.{decimals}f} s"
+        begin, end = f"{begin:.{decimals}f}", f"{end:.{decimals}f}"
+        if when["recording"] is None:
+            return f", in every recording from {begin} s on"
+        return f", in {when['recording']} from {begin} to {end} s"
     return ", where " + " and ".join(
         f"{state_words(name)} is between {number(a)} and {number(b)}"
         for name, (a, b) in when.items()

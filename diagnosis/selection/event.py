@@ -1,6 +1,6 @@
 """An event, an effect that acts only for a while: placed in time, fitted on the windows around it.
 
-local = Local(scene, trajectory, chi2, a, b)         # windows a..b of a Windows
+local = Local(scene, trajectory, chi2, inside)       # indices of windows of a Windows
 event = local.event(look, p_value)                   # look: a Look at the effect
 
 Windows begin at smoothed states, which are free to move: what they explain is projected out.
@@ -22,8 +22,8 @@ ALIKE = 0.8  # of the event's gain, what another effect must gain to be looked a
 
 @dataclass(frozen=True)
 class Event:
-    """candidate: localised; values; recording; time (from, to), s; low, high: 95 % bounds of the
-    values; p_value: corrected for all that was looked at; removed: share of the error around it;
+    """candidate: localised; values; recording, None for every one; time (from, to), s; low, high:
+    95 % bounds of the values; p_value: corrected for all that was looked at; removed: share of the error around it;
     left: squared residual of all windows with it; others: ((candidate, values), ...), what explains
     it as well."""
 
@@ -40,7 +40,7 @@ class Event:
 
     @property
     def when(self):
-        return {"recording": self.recording.name, "time": [float(t) for t in self.time]}
+        return self.candidate.when
 
 
 class Windows:
@@ -109,23 +109,32 @@ class Look:
 
 
 class Local:
-    """The windows around an event's, a..b of a scene, to fit its ends and values in."""
+    """The windows around an event's, those inside it of a scene, to fit its ends and values in."""
 
-    def __init__(self, scene, trajectory, chi2, a, b):
-        """chi2 (W,): squared residuals of the scene's windows without an event."""
+    def __init__(self, scene, trajectory, chi2, inside):
+        """chi2 (W,): squared residuals of the scene's windows without an event; inside: indices in
+        ascending order, of one recording, or to the end of several."""
         owner = [w.recording for w in scene.windows]
-        near = [i for i in range(a - 2, b + 3) if 0 <= i < len(owner) and owner[i] is owner[a]]
-        first, end = scene.windows[near[0]].first, scene.windows[near[-1]].last + 1
-        longer = windowing.consecutive(owner[a], LONGER * SPAN, first, end)
-        self.scene, self.chi2, self.inside = scene, chi2, slice(a, b + 1)
+        longer = []
+        for own in dict.fromkeys(owner[i] for i in inside):
+            mine = [i for i in inside if owner[i] is own]
+            near = [i for i in range(mine[0] - 2, mine[-1] + 3) if owner[i : i + 1] == [own]]
+            first, end = scene.windows[near[0]].first, scene.windows[near[-1]].last + 1
+            longer += windowing.consecutive(own, LONGER * SPAN, first, end)
+        self.scene, self.chi2, self.inside = scene, chi2, inside
         self.local = Windows(scene.world, scene.setting, longer, trajectory, scene.noise)
         self.around = float((self.local.left([scene.setting]) ** 2).sum())
-        self.recording, time = owner[a], owner[a].time
-        self.time = [time[scene.windows[a].first], time[scene.windows[b].last]]
-        self.sample = float(np.median(np.diff(time)))
+        own = {w.recording: w.recording.time for w in longer}
+        self.recording = owner[inside[0]] if len(own) == 1 else None
+        at = [(owner[i].time, scene.windows[i]) for i in inside]
+        self.time = [min(t[w.first] for t, w in at), max(t[w.last] for t, w in at)]
+        if not self.recording:
+            self.time[1] = max(t[-1] for t in own.values())
+        self.sample = float(np.median([np.median(np.diff(t)) for t in own.values()]))
 
     def _placed(self, look, time):
-        when = {"recording": self.recording.name, "time": [float(t) for t in time]}
+        name = self.recording and self.recording.name
+        when = {"recording": name, "time": [float(t) for t in time]}
         return self.scene.world.localised(look.timed, when)
 
     def _fits(self, look, times, values):
@@ -153,7 +162,7 @@ class Local:
             (np.array(values)[which] - look.base[which]) / look.steps + amounts
         )
         for reach in SPAN / 3.0 ** np.arange(4):
-            for end in (0, 1):
+            for end in (0, 1) if self.recording else (0,):  # what is the same in all goes on
                 trials = [ends] + [
                     [t + shift * (i == end) for i, t in enumerate(ends)]
                     for shift in np.linspace(-reach, reach, 6)

@@ -64,7 +64,7 @@ TABLE = {
     "sensor_bias": [("plain", 0.05, -0.5, 0.5)],
     "sensor_scale": [("times", 0.05, 0.5, 2.0)],
     "sensor_delay": [("plain", 0.02, 0.0, 0.1)],
-    "external_force": [("weight", 0.1, -0.5, 0.5)],
+    "external_force": [("weight", 0.1, -2.0, 2.0)],
     "link_length": [("times", 0.1, 0.3, 3.0)],
     "load_friction": [("plain", 0.3, 0.0, 0.9), ("plain", 0.3, 0.0, 0.9), ("plain", 0.5, 0.0, 1.0)],
     "friction_map": [

@@ -56,6 +56,8 @@ def _members(candidates, judge, before, fitted, candidate):
     missing, out = MissingForce(before.chain, rest, before), []
     near = _alike(judge, missing, fitted, candidate, pool)
     for other, values in near[:REFITS]:
+        if (other.effect, other.nominal) == (candidate.effect, candidate.nominal):
+            values = fitted.setting[candidate]  # two geoms of one contact share its numbers
         tried = judge.fit({**rest, other: values}, steps=2)
         if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
             continue

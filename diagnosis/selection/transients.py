@@ -60,15 +60,15 @@ def find(world, recordings, setting, trajectory, noise, lasting=None):
     found = [f for f in (_interval(look, scene.windows, usual) for look in looks) if f]
     if not found:
         return None
-    _, gain, a, b, spread, look = max(found, key=lambda f: f[0])
+    _, gain, inside, spread, look = max(found, key=lambda f: f[0])
     k = len(look.which)
     p = f_sf(gain / k / spread, k, max(number - k, 1)) * number**2 * len(looks)
     ceiling = usual + 4 * (usual - np.quantile(each, 0.16))  # of windows without an event
     excess = ((each - ceiling).clip(0) * scene.rows).sum()
-    inside = ((each - ceiling).clip(0) * scene.rows)[a : b + 1].sum()
-    if p > LEVEL or inside < CONCENTRATED * excess or not _worth(look, scene, chi2, a, gain):
+    there = ((each - ceiling).clip(0) * scene.rows)[inside].sum()
+    if p > LEVEL or there < CONCENTRATED * excess or not _worth(look, scene, chi2, inside, gain):
         return None
-    local = Local(scene, trajectory, chi2, a, b)
+    local = Local(scene, trajectory, chi2, inside)
     curves = dependences(world, trajectory, recordings, most=None)
     if local.lasting(gain, curves, lasting):
         return None
@@ -79,9 +79,10 @@ def find(world, recordings, setting, trajectory, noise, lasting=None):
     return replace(event, others=local.others(event, looks, look, gain))
 
 
-def _worth(look, scene, chi2, a, gain):
-    """Whether an effect takes enough of the error of its own recording for what is asked of any."""
-    own = [w.recording is scene.windows[a].recording for w in scene.windows]
+def _worth(look, scene, chi2, inside, gain):
+    """Whether an effect takes enough of the error of its recordings for what is asked of any."""
+    theirs = {scene.windows[i].recording for i in inside}
+    own = [w.recording in theirs for w in scene.windows]
     removed = np.log(chi2[own].sum() / max(chi2[own].sum() - gain, 1e-300)) / 2
     return removed > PRICE * complexity([look.timed])
 
@@ -120,7 +121,7 @@ def _looks(scene):
 
 
 def _interval(look, windows, usual):
-    """(merit, gain, first, last, spread, look) of the windows in which an effect gains most.
+    """(merit, gain, inside, spread, look) of the windows in which an effect gains most.
 
     merit: the gain less what so many parameters gain of nothing. spread: gain per parameter
     elsewhere.
@@ -128,29 +129,43 @@ def _interval(look, windows, usual):
     k, found = len(look.which), []
     alone = (solved(look.gram, look.score) * look.score).sum(-1)
     spread = max(usual, np.quantile(alone, 0.3) / chi2_ppf(0.3, k))
-    owner = [w.recording for w in windows]
-    most = max(1, int(LONGEST * len(windows)))
-    for r in dict.fromkeys(owner):
-        mine = np.flatnonzero([o is r for o in owner])
-        for a in mine:
-            score = np.cumsum(look.score[a : min(a + most, mine[-1] + 1)], 0)
-            gram = np.cumsum(look.gram[a : a + len(score)], 0)
-            gain = (solved(gram, score) * score).sum(-1)
-            found += [(float(g), a, a + n) for n, g in enumerate(gain)]
-    for gain, a, b in sorted(found, reverse=True)[:TRIES]:
-        score, gram = look.score[a : b + 1], look.gram[a : b + 1]
+    for order, first in _spans(windows):
+        score, gram = look.score[order].cumsum(0), look.gram[order].cumsum(0)
+        gain = (solved(gram, score) * score).sum(-1)
+        found += [(float(g), order[: n + 1]) for n, g in enumerate(gain) if n >= first]
+    for gain, inside in sorted(found, key=lambda f: -f[0])[:TRIES]:
+        inside = np.sort(inside)
+        score, gram = look.score[inside], look.gram[inside]
         value = solved(gram.sum(0), score.sum(0))
         share = 2 * score @ value - np.einsum("i,wij,j->w", value, gram, value)
         if share.max() < ALONE * gain:
             merit = gain - spread * k * np.log(len(windows))
-            return merit, gain, a, b, spread, look
+            return merit, gain, inside, spread, look
     return None
+
+
+def _spans(windows):
+    """[(indices of windows in an order, first)]: an event may be the first n of them, n > first.
+
+    Stretches of one recording; and what begins at the same time in every one and goes on, last
+    windows first.
+    """
+    owner = [w.recording for w in windows]
+    most, out = max(1, int(LONGEST * len(windows))), []
+    recordings = list(dict.fromkeys(owner))
+    for r in recordings:
+        mine = np.array([i for i, o in enumerate(owner) if o is r])
+        out += [(mine[a : a + most], 0) for a in range(len(mine))]
+    if len(recordings) > 1:
+        begin = np.array([w.recording.time[w.first] for w in windows])
+        out.append((np.argsort(-begin, kind="stable")[:most], len(recordings) - 1))
+    return out
 
 
 def quiet(recording, event):
     """[(first row, end row)] of the stretches of a recording that an event does not touch."""
     rows = len(recording.time)
-    if event is None or recording is not event.recording:
+    if event is None or event.recording not in (None, recording):
         return [(recording.start, rows)]
     start, stop = np.searchsorted(recording.time, event.time)
     stretches = (recording.start, int(start)), (int(stop) + 1, rows)

@@ -80,7 +80,11 @@ class Stepwise:
         always, never = (-np.inf, np.inf), (np.inf, np.inf)
         self.low, self.high = np.array(
             [
-                always if not c.when else c.when["time"] if c.when["recording"] == r.name else never
+                always
+                if not c.when
+                else c.when["time"]
+                if c.when["recording"] in (None, r.name)
+                else never
                 for c, r in zip(cases, recordings)
             ]
         ).T

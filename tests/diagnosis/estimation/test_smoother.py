@@ -1,7 +1,6 @@
 """The located force against hidden ones that were put into stock MuJoCo, and against none."""
 
 from copy import copy
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from plants import DRIVEN_PENDULUM, recorded
 
 from diagnosis.estimation import windowing
-from diagnosis.estimation.smoother import LOUDER, Smoother
+from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import World
 
@@ -194,13 +193,27 @@ def test_a_sensor_that_is_off_is_no_missing_force(name, value, off):
     assert np.sqrt(np.mean((under.qpos[5:-5, 0] - seen[5:-5]) ** 2)) < 0.5 * NOISE
 
 
-def test_noise_is_between_what_differences_show_and_a_multiple_of_it():
-    """Where impacts throw a motion off, what is left of it is no noise."""
-    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
-    smoother = Smoother(world, [recorded("0.csv", 0)])
-    shown = smoother.floor.copy()
-    for more, times in ((100.0, LOUDER), (0.01, 1.0)):
-        found = SimpleNamespace(process=np.ones((2, 3)), measurement=(np.full(2, more), np.ones(2)))
-        for _ in range(5):
-            smoother._update(found)
-        np.testing.assert_allclose(smoother.R[:1], times**2 * shown[:1])
+STOPPED = """<mujoco><option timestep="0.001"/><worldbody>{floor}<body name="a" pos="0 0 .35">
+  <joint name="j" axis="0 1 0" damping="0.05" {limit}/>
+  <geom type="capsule" fromto="0 0 0 0.1 0 -.3" size=".02" mass="0.5"/></body></worldbody>
+  <actuator><motor name="m" joint="j"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "floor, limit",
+    [
+        ("", 'limited="true" range="-20 20" solreflimit="{} 1"'),
+        ('<geom type="box" size=".1 1 .1" pos="0.19 0 0.1" solref="{} 1"/>', ""),
+    ],
+)
+def test_what_a_model_errs_where_something_touches_is_no_noise(floor, limit):
+    """Its stop or wall is ten times as stiff as the machine's."""
+    soft, stiff = (
+        STOPPED.format(floor=floor.format(s), limit=limit.format(s)) for s in (0.05, 0.015)
+    )
+    runs = [moved(soft, seed)[0] for seed in range(2)]
+    smoother = Smoother(World(mujoco.MjSpec.from_string(stiff)), runs)
+    trajectory = smoother.locate({})
+    touches = ~smoother._apart(trajectory.qpos, trajectory.free)
+    assert 0.05 < touches.mean() < 0.9
+    assert smoother.position_noise == pytest.approx(NOISE, rel=0.15)

@@ -16,7 +16,7 @@ class Named:
         self.name = name
         overrides = {"overrides": lambda what: False}
         self.effect = SimpleNamespace(simplicity=units - 1, name=name, numerical=False, **overrides)
-        self.parameters = (None,)
+        self.parameters, self.nominal = (None,), (0.0,)
 
 
 DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)
@@ -66,3 +66,17 @@ def test_the_best_for_its_price_stands_and_what_predicts_as_well_is_told(
 ):
     found, told = chosen(monkeypatch, fitted, losses)
     assert found == [name] and told[name] == others
+
+
+def test_the_same_effect_in_a_like_place_begins_at_the_findings_own_value(monkeypatch):
+    """Two geoms of one contact share its numbers, and columns tell little of them."""
+    foot, ground, other = Named("foot", 1), Named("ground", 1), Named("other", 1)
+    ground.effect, begun = foot.effect, []
+    judge = SimpleNamespace(
+        fit=lambda setting, steps=0: begun.append(setting) or SimpleNamespace(settled=False)
+    )
+    monkeypatch.setattr(rivals, "_alike", lambda *args: [(ground, (362.0,)), (other, (5.0,))])
+    monkeypatch.setattr(rivals, "MissingForce", lambda *args: None)
+    fitted = SimpleNamespace(setting={foot: (220.0,)})
+    rivals._members([], judge, SimpleNamespace(chain=None), fitted, foot)
+    assert begun == [{ground: (220.0,)}, {other: (5.0,)}]

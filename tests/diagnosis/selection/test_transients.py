@@ -10,6 +10,7 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 from diagnosis import findings
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
+from diagnosis.report import text
 from diagnosis.selection import transients
 from diagnosis.simulation.simulator import World
 
@@ -123,6 +124,17 @@ def test_a_load_may_be_carried_through_one_recording_of_three():
     assert event.candidate.effect.name == "payload_change" and event.recording is runs[1]
     assert event.values[0] == pytest.approx(1.0, rel=0.03)
     assert event.time == pytest.approx((0.0, 3.99), abs=0.2)  # what is left of whole windows
+
+
+def test_a_load_that_every_recording_picks_up_at_the_same_time_stays():
+    runs = [replace(loaded(k, 1.0, 2.0, (2.2, 9.0)), name=f"run{k}.csv") for k in range(3)]
+    event = found(runs)
+    told = findings.of_event(event)
+    assert told["effect"] == "payload_change" and event.values[0] == pytest.approx(1.0, rel=0.02)
+    assert told["when"]["recording"] is None
+    assert told["when"]["time"] == pytest.approx([2.2, 3.99], abs=0.03)
+    assert "in every recording from 2.2" in text.finding_words(told)
+    assert [r.time[-1] < 2.25 for r in transients.calm(runs, event)] == [True] * 3
 
 
 def test_what_explains_as_much_and_lasts_speaks_against_an_event():
