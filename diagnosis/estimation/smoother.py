@@ -27,6 +27,7 @@ BLOCK = 200  # rows that are smoothed as one piece
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
 NEAR = 2  # rows before and after what touches, whose errors tell no noise
 MOST = 10.0  # factor of a variance in one update
+LOUDER = 20.0  # noise is at most so many times what differences of readings show
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
 
 
@@ -166,7 +167,7 @@ class Smoother:
         seen = self._seen(off)
         for _ in range(passes):
             free = self._touching(qpos)
-            apart = self._apart(qpos, free)
+            apart = np.convolve(free, np.ones(2 * NEAR + 1), "same") == 0
             step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
             for _ in range(UPDATES):
                 found = self._smooth(step, qpos, qvel, seen, apart)
@@ -196,23 +197,8 @@ class Smoother:
         return qpos, qvel, later(*off, self.position), later(*off, self.velocity)
 
     def _touching(self, qpos):
-        """Rows (N,) at or after which something touches; a force there is told by no smooth map."""
-        model = self.model
-        touch = np.zeros(len(qpos), bool)
-        if not any(touchable(model, i).any() for i in range(model.ngeom)) and not model.nflex:
-            return touch
-        data = mujoco.MjData(model)
-        for row, q in enumerate(qpos):
-            data.qpos[:] = q
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_collision(model, data)
-            touch[row] = data.ncon > 0
-        return touch | np.append(touch[1:], False)
-
-    def _apart(self, qpos, free):
-        """Rows (N,) apart from what touches, ends of travel too: what a model errs there is no
-        noise."""
+        """Rows (N,) at or after which something touches, or lies at the end of its travel; a force
+        there is told by no smooth map."""
         model = self.model
         ends = [
             j
@@ -220,8 +206,17 @@ class Smoother:
             if model.jnt_limited[j] and model.jnt_type[j] in (HINGE, SLIDE)
         ]
         at, (low, high) = qpos[:, model.jnt_qposadr[ends]], model.jnt_range[ends].T
-        touch = free | ((at < low) | (at > high)).any(1)
-        return np.convolve(touch, np.ones(2 * NEAR + 1), "same") == 0
+        touch = ((at < low) | (at > high)).any(1)
+        if not any(touchable(model, i).any() for i in range(model.ngeom)) and not model.nflex:
+            return touch | np.append(touch[1:], False)
+        data = mujoco.MjData(model)
+        for row, q in enumerate(qpos):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_collision(model, data)
+            touch[row] |= data.ncon > 0
+        return touch | np.append(touch[1:], False)
 
     def _linear(self, rows, qpos, qvel, force, free, like=None):
         """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a
@@ -292,7 +287,8 @@ class Smoother:
         self.walk = np.maximum(self.walk * ratio(found.process)[2 * nv :], 1e-12 * self.scale**2)
         known = found.measurement[1] > 0
         moved = apart.mean() * self.R * ratio(found.measurement) + (~apart).mean() * self.floor
-        self.R = np.where(known, np.maximum(moved, self.floor), self.R)
+        moved = np.clip(moved, self.floor, LOUDER**2 * self.floor)
+        self.R = np.where(known, moved, self.R)
 
 
 def _measured_velocity(model, recording):

@@ -1,6 +1,7 @@
 """The located force against hidden ones that were put into stock MuJoCo, and against none."""
 
 from copy import copy
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from plants import DRIVEN_PENDULUM, recorded
 
 from diagnosis.estimation import windowing
-from diagnosis.estimation.smoother import Smoother
+from diagnosis.estimation.smoother import LOUDER, Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import World
 
@@ -213,7 +214,17 @@ def test_what_a_model_errs_where_something_touches_is_no_noise(floor, limit):
     )
     runs = [moved(soft, seed)[0] for seed in range(2)]
     smoother = Smoother(World(mujoco.MjSpec.from_string(stiff)), runs)
-    trajectory = smoother.locate({})
-    touches = ~smoother._apart(trajectory.qpos, trajectory.free)
-    assert 0.05 < touches.mean() < 0.9
+    assert 0.02 < smoother.locate({}).free.mean() < 0.9
     assert smoother.position_noise == pytest.approx(NOISE, rel=0.15)
+
+
+def test_noise_is_between_what_differences_show_and_a_multiple_of_it():
+    """Where a model is far off, what is left of the motion is no noise."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    smoother = Smoother(world, [recorded("0.csv", 0)])
+    shown = smoother.floor.copy()
+    for more, times in ((100.0, LOUDER), (0.01, 1.0)):
+        found = SimpleNamespace(process=np.ones((2, 3)), measurement=(np.full(2, more), np.ones(2)))
+        for _ in range(5):
+            smoother._update(found, np.ones(len(smoother.qpos), bool))
+        np.testing.assert_allclose(smoother.R[:1], times**2 * shown[:1])

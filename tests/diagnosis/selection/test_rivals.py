@@ -16,7 +16,7 @@ class Named:
         self.name = name
         overrides = {"overrides": lambda what: False}
         self.effect = SimpleNamespace(simplicity=units - 1, name=name, numerical=False, **overrides)
-        self.parameters, self.nominal = (None,), (0.0,)
+        self.parameters = (None,)
 
 
 DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)
@@ -40,6 +40,7 @@ def chosen(monkeypatch, fitted, losses):
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
     silent = SimpleNamespace(scores=lambda *settings: None, chain=SimpleNamespace(world=None))
+    monkeypatch.setattr(rivals, "_near", lambda *args: [])
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
     monkeypatch.setattr(rivals, "_late", lambda *args: [])
     start = Judge().fit({names[fitted]: (2.0,)})
@@ -68,15 +69,20 @@ def test_the_best_for_its_price_stands_and_what_predicts_as_well_is_told(
     assert found == [name] and told[name] == others
 
 
-def test_the_same_effect_in_a_like_place_begins_at_the_findings_own_value(monkeypatch):
-    """Two geoms of one contact share its numbers, and columns tell little of them."""
-    foot, ground, other = Named("foot", 1), Named("ground", 1), Named("other", 1)
-    ground.effect, begun = foot.effect, []
+def test_the_same_effect_in_a_like_place_is_tried_at_the_findings_own_value(monkeypatch):
+    """Two geoms of one contact share its numbers."""
+    foot, ground, elsewhere, other = (Named(n, 1) for n in ("foot", "ground", "else", "other"))
+    ground.effect = elsewhere.effect = foot.effect
+    foot.nominal = ground.nominal = (100.0,)
+    elsewhere.nominal = other.nominal = (50.0,)
+    begun = []
     judge = SimpleNamespace(
         fit=lambda setting, steps=0: begun.append(setting) or SimpleNamespace(settled=False)
     )
-    monkeypatch.setattr(rivals, "_alike", lambda *args: [(ground, (362.0,)), (other, (5.0,))])
+    monkeypatch.setattr(rivals, "_alike", lambda *args: [(other, (5.0,)), (ground, (362.0,))])
+    monkeypatch.setattr(rivals, "_near", lambda *args: [ground, elsewhere, other])
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: None)
+    before = SimpleNamespace(chain=SimpleNamespace(world=None))
     fitted = SimpleNamespace(setting={foot: (220.0,)})
-    rivals._members([], judge, SimpleNamespace(chain=None), fitted, foot)
+    rivals._members([], judge, before, fitted, foot)
     assert begun == [{ground: (220.0,)}, {other: (5.0,)}]
