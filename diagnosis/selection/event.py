@@ -23,9 +23,9 @@ ALIKE = 0.8  # of the event's gain, what another effect must gain to be looked a
 @dataclass(frozen=True)
 class Event:
     """candidate: localised; values; recording, None for every one; time (from, to), s; low, high:
-    95 % bounds of the values; p_value: corrected for all that was looked at; removed: share of the error around it;
-    left: squared residual of all windows with it; others: ((candidate, values), ...), what explains
-    it as well."""
+    95 % bounds of the values; p_value: corrected for all that was looked at; removed: share of the
+    error around it; left: squared residual of all windows with it; others: ((candidate, values),
+    ...), what explains it as well."""
 
     candidate: object
     values: tuple
@@ -114,11 +114,11 @@ class Local:
     def __init__(self, scene, trajectory, chi2, inside):
         """chi2 (W,): squared residuals of the scene's windows without an event; inside: indices in
         ascending order, of one recording, or to the end of several."""
-        owner = [w.recording for w in scene.windows]
+        owner = dict(enumerate(w.recording for w in scene.windows))
         longer = []
         for own in dict.fromkeys(owner[i] for i in inside):
             mine = [i for i in inside if owner[i] is own]
-            near = [i for i in range(mine[0] - 2, mine[-1] + 3) if owner[i : i + 1] == [own]]
+            near = [i for i in range(mine[0] - 2, mine[-1] + 3) if owner.get(i) is own]
             first, end = scene.windows[near[0]].first, scene.windows[near[-1]].last + 1
             longer += windowing.consecutive(own, LONGER * SPAN, first, end)
         self.scene, self.chi2, self.inside = scene, chi2, inside

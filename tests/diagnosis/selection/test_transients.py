@@ -66,6 +66,11 @@ def test_a_push_is_placed_in_time_and_what_is_calm_is_cut_out():
     np.testing.assert_array_equal(parts[2].qpos, runs[1].qpos[-len(parts[2].time) :])
 
 
+def test_a_push_may_be_there_when_the_only_recording_begins():
+    event = found([recorded("run.csv", 1, push=lambda time, q, v: 0.3 * (time < 0.9))])
+    assert event.time == pytest.approx((0.0, 0.9), abs=0.1)
+
+
 def test_a_push_that_is_certain_but_changes_little_is_no_event(monkeypatch):
     pushed = lambda time, q, v: 0.004 * (1.0 < time < 3.0)
     runs = [recorded(f"{k}.csv", k, push=pushed if k == 1 else None) for k in range(3)]
