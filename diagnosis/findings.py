@@ -153,7 +153,7 @@ def of_event(event):
         "adequate": True,
         "strains": None,
         "depends_on": ["time"],
-        "when": event.when,
+        "when": event.candidate.when,
         "written_as": "none",
         "also_possible": [told(c, values) for c, values in event.others],
     }

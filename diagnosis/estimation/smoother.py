@@ -200,22 +200,17 @@ class Smoother:
         """Rows (N,) at or after which something touches, or lies at the end of its travel; a force
         there is told by no smooth map."""
         model = self.model
-        ends = [
-            j
-            for j in range(model.njnt)
-            if model.jnt_limited[j] and model.jnt_type[j] in (HINGE, SLIDE)
-        ]
+        ends = (model.jnt_limited != 0) & np.isin(model.jnt_type, (HINGE, SLIDE))
         at, (low, high) = qpos[:, model.jnt_qposadr[ends]], model.jnt_range[ends].T
         touch = ((at < low) | (at > high)).any(1)
-        if not any(touchable(model, i).any() for i in range(model.ngeom)) and not model.nflex:
-            return touch | np.append(touch[1:], False)
-        data = mujoco.MjData(model)
-        for row, q in enumerate(qpos):
-            data.qpos[:] = q
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_collision(model, data)
-            touch[row] |= data.ncon > 0
+        if model.nflex or any(touchable(model, i).any() for i in range(model.ngeom)):
+            data = mujoco.MjData(model)
+            for row, q in enumerate(qpos):
+                data.qpos[:] = q
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                mujoco.mj_collision(model, data)
+                touch[row] |= data.ncon > 0
         return touch | np.append(touch[1:], False)
 
     def _linear(self, rows, qpos, qvel, force, free, like=None):

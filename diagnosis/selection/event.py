@@ -38,10 +38,6 @@ class Event:
     removed: float = 0.0
     others: tuple = ()
 
-    @property
-    def when(self):
-        return self.candidate.when
-
 
 class Windows:
     """Residuals of windows in noises, with what their start states explain taken out."""
@@ -114,23 +110,21 @@ class Local:
     def __init__(self, scene, trajectory, chi2, inside):
         """chi2 (W,): squared residuals of the scene's windows without an event; inside: indices in
         ascending order, of one recording, or to the end of several."""
-        owner = dict(enumerate(w.recording for w in scene.windows))
-        longer = []
-        for own in dict.fromkeys(owner[i] for i in inside):
-            mine = [i for i in inside if owner[i] is own]
-            near = [i for i in range(mine[0] - 2, mine[-1] + 3) if owner.get(i) is own]
-            first, end = scene.windows[near[0]].first, scene.windows[near[-1]].last + 1
-            longer += windowing.consecutive(own, LONGER * SPAN, first, end)
+        windows, longer = dict(enumerate(scene.windows)), []
+        within = [windows[i] for i in inside]
+        recordings = windowing.recordings_of(within)
+        for r in recordings:
+            mine = [i for i in inside if windows[i].recording is r]
+            near = [windows.get(i) for i in range(mine[0] - 2, mine[-1] + 3)]
+            near = [w for w in near if w and w.recording is r]
+            longer += windowing.consecutive(r, LONGER * SPAN, near[0].first, near[-1].last + 1)
         self.scene, self.chi2, self.inside = scene, chi2, inside
         self.local = Windows(scene.world, scene.setting, longer, trajectory, scene.noise)
         self.around = float((self.local.left([scene.setting]) ** 2).sum())
-        own = {w.recording: w.recording.time for w in longer}
-        self.recording = owner[inside[0]] if len(own) == 1 else None
-        at = [(owner[i].time, scene.windows[i]) for i in inside]
-        self.time = [min(t[w.first] for t, w in at), max(t[w.last] for t, w in at)]
-        if not self.recording:
-            self.time[1] = max(t[-1] for t in own.values())
-        self.sample = float(np.median([np.median(np.diff(t)) for t in own.values()]))
+        self.recording = recordings[0] if len(recordings) == 1 else None
+        begin = min(w.recording.time[w.first] for w in within)
+        end = max(w.recording.time[w.last if self.recording else -1] for w in within)
+        self.time, self.sample = [begin, end], float(windowing.sampling(recordings))
 
     def _placed(self, look, time):
         name = self.recording and self.recording.name

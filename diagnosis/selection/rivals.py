@@ -54,13 +54,13 @@ def _members(candidates, judge, before, fitted, candidate):
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting]
     missing, out = MissingForce(before.chain, rest, before), []
-    near = dict(_alike(judge, missing, fitted, candidate, pool))
-    same = lambda c: (c.effect, c.nominal) == (candidate.effect, candidate.nominal)
     # two geoms of one contact share its numbers, and columns tell little of them
-    own = {
-        c: fitted.setting[candidate] for c in _near(before.chain.world, candidate, pool) if same(c)
-    }
-    for other, values in list({**own, **near, **own}.items())[:REFITS]:
+    twin = lambda c: (c.effect, c.nominal) == (candidate.effect, candidate.nominal)
+    twins = [c for c in _near(before.chain.world, candidate, pool) if twin(c)]
+    near = [(c, fitted.setting[candidate]) for c in twins]
+    alike = _alike(judge, missing, fitted, candidate, pool)
+    near += [(other, values) for other, values in alike if other not in twins]
+    for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2)
         if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
             continue

@@ -56,8 +56,8 @@ def find(world, recordings, setting, trajectory, noise, lasting=None):
     chi2 = (scene.left([setting])[0] ** 2).sum(1)
     each = chi2 / scene.rows
     usual = np.median(each)
-    looks = _looks(scene)
-    found = [f for f in (_interval(look, scene.windows, usual) for look in looks) if f]
+    looks, spans = _looks(scene), _spans(scene.windows)
+    found = [f for f in (_interval(look, spans, usual) for look in looks) if f]
     if not found:
         return None
     _, gain, inside, spread, look = max(found, key=lambda f: f[0])
@@ -120,7 +120,7 @@ def _looks(scene):
     return out
 
 
-def _interval(look, windows, usual):
+def _interval(look, spans, usual):
     """(merit, gain, inside, spread, look) of the windows in which an effect gains most.
 
     merit: the gain less what so many parameters gain of nothing. spread: gain per parameter
@@ -129,17 +129,17 @@ def _interval(look, windows, usual):
     k, found = len(look.which), []
     alone = (solved(look.gram, look.score) * look.score).sum(-1)
     spread = max(usual, np.quantile(alone, 0.3) / chi2_ppf(0.3, k))
-    for order, first in _spans(windows):
+    for order, first in spans:
         score, gram = look.score[order].cumsum(0), look.gram[order].cumsum(0)
         gain = (solved(gram, score) * score).sum(-1)
-        found += [(float(g), order[: n + 1]) for n, g in enumerate(gain) if n >= first]
-    for gain, inside in sorted(found, key=lambda f: -f[0])[:TRIES]:
-        inside = np.sort(inside)
+        found += [(float(g), order, n) for n, g in enumerate(gain, 1) if n > first]
+    for gain, order, n in sorted(found, key=lambda f: -f[0])[:TRIES]:
+        inside = np.sort(order[:n])
         score, gram = look.score[inside], look.gram[inside]
         value = solved(gram.sum(0), score.sum(0))
         share = 2 * score @ value - np.einsum("i,wij,j->w", value, gram, value)
         if share.max() < ALONE * gain:
-            merit = gain - spread * k * np.log(len(windows))
+            merit = gain - spread * k * np.log(len(alone))
             return merit, gain, inside, spread, look
     return None
 

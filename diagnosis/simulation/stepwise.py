@@ -77,17 +77,7 @@ class Stepwise:
     def __init__(self, batch, cases, recordings, drives, begin, step):
         """drives: lists of the Drives (S,) while the condition of each holds, and while not."""
         self.batch, self.begin, self.step = batch, begin, step
-        always, never = (-np.inf, np.inf), (np.inf, np.inf)
-        self.low, self.high = np.array(
-            [
-                always
-                if not c.when
-                else c.when["time"]
-                if c.when["recording"] in (None, r.name)
-                else never
-                for c, r in zip(cases, recordings)
-            ]
-        ).T
+        self.low, self.high = np.array([_span(c.when, r) for c, r in zip(cases, recordings)]).T
         conditional = any(c.when for c in cases)
         self.sides = [Side(batch.model, side) for side in drives[: 1 + conditional]]
         self._complete()
@@ -144,6 +134,13 @@ class Stepwise:
             return of(self.sides[0])
         on, off = map(of, self.sides)
         return np.where(active.reshape(-1, *[1] * (on.ndim - 1)), on, off)
+
+
+def _span(when, recording):
+    """(from, to) of a recording's time in which a condition holds, s; infinite where always."""
+    if not when:
+        return -np.inf, np.inf
+    return when["time"] if when["recording"] in (None, recording.name) else (np.inf, np.inf)
 
 
 def number(model, name):

@@ -72,3 +72,14 @@ def test_scores_of_the_variances_are_derivatives_of_the_likelihood(problem):
         # what was measured weighs the squares with R's square, what is expected alike
         score = problem["R"][i] * (found.measurement[0][i] - found.measurement[1][i]) / 2
         assert score == pytest.approx(slope("R", i), abs=1e-6)
+
+
+def test_of_the_noise_only_rows_that_count_are_asked(problem):
+    whole, some = smooth(**problem), np.arange(T * B).reshape(T, B) % 3 == 0
+    parts = [smooth(**problem, counts=counts) for counts in (some, ~some)]
+    for k in (0, 1):
+        both = sum(part.measurement[k] for part in parts)
+        np.testing.assert_allclose(both, whole.measurement[k])
+        assert (parts[0].measurement[k] < whole.measurement[k]).all()
+    for part in parts:
+        np.testing.assert_array_equal(part.state, whole.state)
