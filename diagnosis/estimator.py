@@ -16,7 +16,9 @@ from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
+from diagnosis.selection.conditions import concentrated
 from diagnosis.selection.criterion import PRICE, complexity, paired
+from diagnosis.selection.event import Event
 from diagnosis.selection.identification import (
     Found,
     Identification,
@@ -83,7 +85,8 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     fitted = changing(found.judge, fitted)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
-    outcome.event, outcome.earned = event, bool(outcome.fitted.setting or event)
+    outcome.event = event or _sometimes(search, found, outcome.fitted, log)
+    outcome.earned = bool(outcome.fitted.setting or outcome.event)
     say(0.85, "checking what is handed over")
     _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
     say(0.95, "held-out error")
@@ -112,13 +115,27 @@ def _checked(search, found, fitted, others, log):
     return Outcome(found, fitted, trajectory, others, {}, {}, left, dependences)
 
 
-def _beside(search, judge, fitted, rest, price):
+def _sometimes(search, found, fitted, log):
+    """The Event of a force that is missing beside a Fitted set under a condition only, or None."""
+    where = concentrated(fitted)
+    rest = where and where.dependence(search.world, found.trajectory, search.train)
+    beside = rest and _beside(search, found.judge, fitted, rest, PRICE * UNNAMED, where.number)
+    if not beside:
+        return None
+    losses = f"{fitted.loss:.3f} -> {beside.loss:.3f}"
+    log(f"  {rest.variables} at times: {rest.candidate.when} {losses}")
+    values, p = beside.setting[rest.candidate], paired(fitted.score, beside.score).p_value
+    told = rest.candidate, values, where.recording, where.time, min(p * where.number, 1.0)
+    return Event(*told, low=values, high=values, removed=where.removed(fitted, beside))
+
+
+def _beside(search, judge, fitted, rest, price, number=1):
     """The Fitted set with a curve beside, or None where it does not earn its place: as it was
-    located, and then refitted."""
+    located, and then refitted. number: of conditions that it was chosen from."""
     for steps in (0, 2):
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=steps)
         step = paired(fitted.score, beside.score)
-        if step.gain < price or not search.no_chance(step):
+        if step.gain < price or not search.no_chance(step, number=number):
             return None
     return beside
 

@@ -108,11 +108,6 @@ def verdict(findings, something):
 def _finding(world, candidate, outcome, bounds, figure):
     values, handed = outcome.fitted.setting[candidate], outcome.handed
     curve = candidate.effect.name == "unknown"
-    form = (
-        {key: getattr(candidate.effect, key) for key in ("variable", "factor", "wave")}
-        if curve
-        else None
-    )
     before, after = figure["before"], figure["after"]
     return {
         "effect": candidate.effect.name,
@@ -131,12 +126,13 @@ def _finding(world, candidate, outcome, bounds, figure):
             {"effect": c.effect.name, "place": place_of(c), "parameters": parameters_of(c, v)}
             for c, v in outcome.others.get(candidate, [])
         ],
-        **({"curve": form} if curve else {}),
+        **({"curve": form_of(candidate)} if curve else {}),
     }
 
 
 def of_event(event):
     """The finding of an Event, as diagnosis.json has it."""
+    curve = event.candidate.effect.name == "unknown"
     told = lambda candidate, *values: {
         "effect": candidate.effect.name,
         "place": place_of(candidate),
@@ -150,13 +146,19 @@ def of_event(event):
             "error_removed_there": event.removed,
             "p_value": event.p_value,
         },
-        "adequate": True,
+        "adequate": not curve,
         "strains": None,
-        "depends_on": ["time"],
+        "depends_on": depends_on(None, event.candidate) if curve else ["time"],
         "when": event.candidate.when,
         "written_as": "none",
         "also_possible": [told(c, values) for c, values in event.others],
+        **({"curve": form_of(event.candidate)} if curve else {}),
     }
+
+
+def form_of(candidate):
+    """The variable of a curve, what it is multiplied by, and whether it is a wave."""
+    return {key: getattr(candidate.effect, key) for key in ("variable", "factor", "wave")}
 
 
 def certain(candidate, bounds):

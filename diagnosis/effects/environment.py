@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from diagnosis.effects.base import Effect, Parameter, catalogue, displace
+from diagnosis.effects.base import Effect, Parameter, catalogue, displace, runge_kutta
 
 FACTORS = (
     0.25,
@@ -100,8 +100,9 @@ class TimeStep(Effect):
 
     def parameters(self, model, i):
         h = model.opt.timestep
-        # a quarter leaves a quarter of the error; finer is dear
-        return (Parameter("seconds", "s", h, h / 4, h, -h / 4),)
+        # a quarter leaves a quarter of the error; finer is dear, as Runge-Kutta's method is
+        finest = h / 2 if runge_kutta(model) else h / 4
+        return (Parameter("seconds", "s", h, finest, h, -h / 4),)
 
     def probes(self, model, i, recordings):
         return model.opt.timestep / np.array([[2.0]])

@@ -101,7 +101,7 @@ class Ahead:
         qpos = windowing.integrate(self.model, np.tile(self.qpos, (1 + n, 1)), moved[:, :nv])
         qvel = np.tile(self.qvel, (1 + n, 1)) + moved[:, nv:]
         each = [self.roughly(self.base)] * len(moved)
-        qpos = self.world.simulate(each, qpos, qvel, self.windows * (1 + n))[0]
+        qpos = self.world.quick.simulate(each, qpos, qvel, self.windows * (1 + n))[0]
         gaps = self._gaps(qpos.reshape(1 + n, W, *qpos.shape[1:]))
         change = gaps[0] - gaps[1:]
         change[(abs(gaps) >= self.travel)[1:] | (abs(gaps[0]) >= self.travel)] = 0.0
@@ -111,23 +111,26 @@ class Ahead:
         """Measured less predicted, (settings, W, T, nv): 0 where nothing was measured, no farther
         than the travel. refine: the time step is divided by it."""
         qvel = np.concatenate([self._velocities(s, refine) for s in settings])
-        return self._simulated(settings, qvel, refine)
+        return self._simulated(self.world, settings, qvel, refine)
 
     def rough(self, settings):
         """As of residual(), for columns, which are differences of two of these: what a coarse step
-        does wrong it does in both."""
-        return self._simulated(
-            [*map(self.roughly, settings)], np.tile(self.qvel, (len(settings), 1))
-        )
+        or a simple integrator does wrong it does in both."""
+        some, qvel = [*map(self.roughly, settings)], np.tile(self.qvel, (len(settings), 1))
+        return self._simulated(self.world.quick, some, qvel)
+
+    def same(self, setting):
+        """Whether rough() simulates a setting as residual() does."""
+        return self.world.quick is self.world and self.roughly(setting) == setting
 
     def roughly(self, setting):
         """A setting with the time step of columns."""
         return {**with_own_step(setting), **self.coarse}
 
-    def _simulated(self, settings, qvel, refine=1):
+    def _simulated(self, world, settings, qvel, refine=1):
         n, each = len(settings), [s for s in settings for _ in self.windows]
         starts = np.tile(self.qpos, (n, 1)), qvel
-        qpos = self.world.simulate(each, *starts, self.windows * n, refine)[0]
+        qpos = world.simulate(each, *starts, self.windows * n, refine)[0]
         return self._gaps(qpos.reshape(n, len(self.windows), *qpos.shape[1:]))
 
     def _gaps(self, qpos):

@@ -72,7 +72,7 @@ class Columns:
         self.seen = {} if seen is None else seen
         self.residual = ahead.residual([setting])[0] if residual is None else residual
         self.rough = self.residual
-        if ahead.roughly(setting) != setting:
+        if not ahead.same(setting):
             self.rough = ahead.rough([setting])[0]
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts, self.begun = [], []  # the Start of every option

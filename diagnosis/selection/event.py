@@ -47,10 +47,11 @@ class Windows:
         self.world, self.setting, self.windows = world, setting, windows
         self.qpos, self.qvel = trajectory.at(windows)
         self.measured, self.noise = windowing.measured(windows), noise
-        self.residual = self._raw([setting])[0]
+        self.residual = self._raw(world, [setting])[0]
         small = np.concatenate([1e-5 * np.ones_like(noise), 1e-4 * np.ones_like(noise)])
+        plain = self._raw(world.quick, [setting])[0]
         slopes = [
-            (self._raw([setting], eps * unit)[0] - self.residual) / eps
+            (self._raw(world.quick, [setting], eps * unit)[0] - plain) / eps
             for eps, unit in zip(small, np.eye(len(small)))
         ]
         self.known = self.residual != 0
@@ -58,9 +59,9 @@ class Windows:
         self.basis = np.linalg.qr(np.stack(slopes, -1))[0]
         self.rows = np.maximum(self.known.sum(1) - self.basis.shape[-1], 1)
 
-    def _raw(self, settings, moved=None):
+    def _raw(self, world, settings, moved=None):
         """Measured less predicted in noises, (settings, W, rows); 0 where either is missing."""
-        model, n = self.world.model, len(settings)
+        model, n = world.model, len(settings)
         moved = np.zeros(2 * model.nv) if moved is None else moved
         qpos = np.tile(
             windowing.integrate(model, self.qpos, np.tile(moved[: model.nv], (len(self.qpos), 1))),
@@ -68,17 +69,23 @@ class Windows:
         )
         qvel = np.tile(self.qvel + moved[model.nv :], (n, 1))
         each = [s for s in settings for _ in self.windows]
-        path = self.world.simulate(each, qpos, qvel, self.windows * n)[0]
+        path = world.simulate(each, qpos, qvel, self.windows * n)[0]
         with np.errstate(invalid="ignore", over="ignore"):
             gap = windowing.difference(model, path, np.tile(self.measured, (n, 1, 1))) / self.noise
         return np.where(np.isfinite(gap), gap, 0.0).reshape(n, len(self.windows), -1)
 
     def left(self, settings):
         """What settings leave beside free start states, (settings, W, rows)."""
-        raw = self._raw(settings)
-        return raw - np.einsum(
-            "wrk,swk->swr", self.basis, np.einsum("wrk,swr->swk", self.basis, raw)
-        )
+        return self._beside(self._raw(self.world, settings))
+
+    def changes(self, settings):
+        """What settings change of that, (settings, W, rows): differences of quick simulations."""
+        plain, *moved = self._raw(self.world.quick, [self.setting, *settings])
+        return self._beside(plain - np.array(moved))
+
+    def _beside(self, raw):
+        explained = np.einsum("wrk,swr->swk", self.basis, raw)
+        return raw - np.einsum("wrk,swk->swr", self.basis, explained)
 
 
 @dataclass(frozen=True)

@@ -132,6 +132,8 @@ class Identification:
         if best is not now:
             best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
+        elif len(setting) > 1:  # chosen along a motion that was another one
+            best = self.pruned(judge, now, judge.fit({}))
         better = best.setting.keys() != setting.keys()
         return best, better, [] if setting else self._ranking(beam, start, nodes)
 
@@ -206,11 +208,11 @@ class Identification:
         added = len(after.setting.keys() - before.setting.keys())
         return after.loss < before.loss and self.no_chance(step, added)
 
-    def no_chance(self, step, added=1):
+    def no_chance(self, step, added=1, number=1):
         """Whether a Comparison is significant among all sets of so many different columns, with two
-        tests each."""
+        tests each, under so many conditions."""
         sets = self.looked**added / factorial(added)
-        return step.p_value < LEVEL / max(sets, self.looked) / 2
+        return step.p_value < LEVEL / max(sets, self.looked) / number / 2
 
     def pruned(self, judge, fitted, now):
         """Without the effects that do not earn their place beside the others, as long as what stays

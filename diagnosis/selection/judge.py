@@ -93,25 +93,26 @@ class Judge:
         if told <= DONE:
             return None, False
         now += self._prior(columns.setting, evidence)
-        better, gained = self._lower(columns, evidence, amounts, now)
-        return better, better is not None and abs(gained - told) < TRUE * told
+        return self._lower(columns, evidence, amounts, now, told)
 
-    def _lower(self, columns, evidence, amounts, now):
+    def _lower(self, columns, evidence, amounts, now, told):
         """((setting, residual) after a step that lowers the loss from what it is now by more than
-        DONE, or None; by how much): of the whole step and thirds of it, the first that is better
-        than the next."""
-        best, most, share = None, DONE, 1.0
-        for _ in range(THIRDS):
-            moved = moved_setting(columns, share * amounts)
-            share /= 3
+        DONE, or None; whether by about as much as told): the whole step, or of it and thirds of it
+        the first that is better than the next."""
+        best, most, as_told = None, DONE, False
+        for third in range(THIRDS):
+            moved = moved_setting(columns, amounts / 3**third)
             if np.isfinite(self.cost(moved)):
                 residual = self.ahead.residual([moved])[0]
                 gained = now - self._whole(residual, moved, evidence)
                 if gained > most:
                     best, most = (moved, residual), gained
+                    as_told = abs(gained - told) < TRUE * told
                 elif best:
                     break
-        return best, most
+            if as_told:
+                break
+        return best, as_told
 
     def _whole(self, residual, setting, evidence):
         """Loss of a residual with nothing left out, priors included."""

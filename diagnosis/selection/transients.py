@@ -108,8 +108,8 @@ def _looks(scene):
         steady = by[name, timed.place]
         base = np.array(setting.get(steady, steady.nominal), float)
         steps = np.array([p.step for p in timed.parameters])
-        moved = scene.left([{**setting, timed: tuple(row)} for row in base + np.diag(steps)])
-        columns = np.moveaxis(plain - moved, 0, -1)
+        moved = [{**setting, timed: tuple(row)} for row in base + np.diag(steps)]
+        columns = np.moveaxis(scene.changes(moved), 0, -1)
         which = np.flatnonzero((columns**2).sum((0, 1)) > UNSEEN)
         if which.size:
             columns = columns[..., which]

@@ -50,14 +50,14 @@ class Curve:
     values: np.ndarray
 
 
-def dependences(world, trajectory, recordings, most=4):
+def dependences(world, trajectory, recordings, most=4, rows=True):
     """The Dependences of the located force of every hinge and slide, first those that stand out
     most of how far it scatters: where little is known of a force, what is located is smooth, and
-    any curve over time follows it."""
+    any curve over time follows it. rows (n,): which ones are looked at."""
     model, found = world.model, []
     ctrl = np.concatenate([r.ctrl for r in recordings])
     time = np.concatenate([r.time for r in recordings])
-    keep = ~trajectory.free & np.isfinite(trajectory.force).all(1)
+    keep = ~trajectory.free & np.isfinite(trajectory.force).all(1) & rows
     block = np.arange(keep.sum()) * BLOCKS // max(keep.sum(), 1)
     axes, scatter = _axes(model, trajectory, ctrl, time), trajectory.located()[1]
     for j in range(model.njnt):

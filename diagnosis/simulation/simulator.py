@@ -8,6 +8,7 @@ xml, written = world.corrected_xml({friction: (0.1,)})
 """
 
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from diagnosis.common.mujoco_warnings import quiet
 from diagnosis.effects import EFFECTS, unmodelled
-from diagnosis.effects.base import HINGE, SLIDE, Candidate, Place, joints_of
+from diagnosis.effects.base import HINGE, SLIDE, Candidate, Place, joints_of, runge_kutta
 from diagnosis.simulation.batch import Engine
 from diagnosis.simulation.control_signal import SLACK
 
@@ -89,6 +90,16 @@ class World:
         if path is None:
             raise ValueError(f"{env_id} is not a MuJoCo environment")
         return cls.load(path)
+
+    @cached_property
+    def quick(self):
+        """The same World with one evaluation of forces in a time step, for what is a difference of
+        two simulations: Runge-Kutta's method takes four."""
+        if not runge_kutta(self.model):
+            return self
+        spec = self.spec.copy()
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        return World(spec)
 
     def candidate(self, effect, place):
         """The Candidate of an effect and a place, by their names; KeyError if it cannot sit

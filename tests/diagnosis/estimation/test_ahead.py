@@ -55,6 +55,21 @@ def test_residuals_are_those_of_stock_steps_and_what_is_lost_is_no_farther_than_
     assert (lost[ahead.known] == ahead.travel[0]).all() and (lost[~ahead.known] == 0).all()
 
 
+def test_columns_of_a_runge_kutta_model_take_one_evaluation_a_step_and_are_the_same():
+    plain = world()
+    assert plain.quick is plain
+    here = World(mujoco.MjSpec.from_string(XML.replace("<option", "<option integrator='RK4'")))
+    assert here.quick.model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    ahead = Ahead(here, cut_ahead([recorded("run.csv", 3, seconds=8.0)]), np.array([NOISE]))
+    damping = here.candidate("viscous_damping", "pivot")
+    exact, quick = (
+        np.subtract(*each([{}, {damping: (0.1,)}])) for each in (ahead.residual, ahead.rough)
+    )
+    assert (exact * quick).sum() / np.linalg.norm(exact) / np.linalg.norm(quick) > 0.999
+    assert np.linalg.norm(quick) == pytest.approx(np.linalg.norm(exact), rel=0.05)
+    assert not ahead.same({}) and Ahead(plain, ahead.windows, ahead.noise).same({})
+
+
 def test_bands_are_of_time_ahead_and_unmeasured_rows_count_nowhere():
     run = recorded("run.csv", 3, seconds=20.0)
     run.qpos[40:60] = np.nan

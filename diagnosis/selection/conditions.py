@@ -1,0 +1,87 @@
+"""A force without a name that is missing under a condition only: in one recording of several, or
+from some moment on in all of them.
+
+where = concentrated(fitted)                  # None, or a Condition
+found = where.dependence(world, trajectory, recordings)
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from diagnosis.estimation import windowing
+from diagnosis.selection.criterion import BEYOND
+from diagnosis.selection.unmodelled_force import dependences
+
+CONCENTRATED = 0.8  # of what is beyond the noise, the share that lies where a condition holds
+LONGEST = 0.6  # of all windows: what lasts longer is no condition
+
+
+@dataclass(frozen=True)
+class Condition:
+    """recording: None for every one; time: (from, to), s; inside (W,): in which windows it holds;
+    number: how many were compared."""
+
+    recording: object
+    time: tuple
+    inside: np.ndarray
+    number: int
+
+    @property
+    def when(self):
+        """As a Candidate has it."""
+        name = self.recording and self.recording.name
+        return {"recording": name, "time": [float(t) for t in self.time]}
+
+    def rows(self, recordings):
+        """Which rows (n,) of recordings, one after the other, it holds in."""
+        own = [self.recording in (None, r) for r in recordings]
+        inside = lambda t: (self.time[0] <= t) & (t <= self.time[1])
+        return np.concatenate([yes & inside(r.time) for yes, r in zip(own, recordings)])
+
+    def dependence(self, world, trajectory, recordings):
+        """The Dependence of the located force there, acting there only; None where it follows
+        nothing."""
+        rows = self.rows(recordings)
+        for found in dependences(world, trajectory, recordings, most=1, rows=rows):
+            return replace(found, candidate=world.localised(found.candidate, self.when))
+        return None
+
+    def removed(self, before, after):
+        """Share of the error there that one Fitted set removes of another one's."""
+        left = [_squares(fitted)[self.inside].sum() for fitted in (after, before)]
+        return float(1 - np.sqrt(left[0] / left[1]))
+
+
+def _squares(fitted):
+    """Mean squared residual of the windows (W,) of a Fitted set, in noises."""
+    ahead = fitted.columns.ahead
+    known = ahead.known & np.isfinite(ahead.noise)
+    noise = np.where(np.isfinite(ahead.noise), ahead.noise, 1.0)
+    square = (fitted.columns.residual / noise) ** 2 * known
+    return square.sum((1, 2)) / np.maximum(known.sum((1, 2)), 1)
+
+
+def concentrated(fitted):
+    """The Condition under which most is left of what a Fitted set does not explain, for the share
+    of the windows that it holds in; None where no such one holds what is left."""
+    excess = np.maximum(_squares(fitted) - BEYOND**2, 0.0)
+    some = [c for c in _conditions(fitted.columns.ahead.windows) if c[-1].mean() <= LONGEST]
+    if not some or not excess.any():
+        return None
+    share = [excess[inside].sum() / excess.sum() for *_, inside in some]
+    best = int(np.argmax([s - inside.mean() for s, (*_, inside) in zip(share, some)]))
+    return Condition(*some[best], len(some)) if share[best] >= CONCENTRATED else None
+
+
+def _conditions(windows):
+    """[(recording, (from, to), which windows (W,))] of every recording, and every moment at which a
+    window begins."""
+    recordings = windowing.recordings_of(windows)
+    if len(recordings) < 2:
+        return []
+    owner, end = [w.recording for w in windows], max(r.time[-1] for r in recordings)
+    begin = np.array([w.recording.time[w.first] for w in windows])
+    single = [(r, (r.time[0], r.time[-1]), np.array([o is r for o in owner])) for r in recordings]
+    moments = [(None, (t, end), begin >= t) for t in np.unique(begin)[1:]]
+    return single + moments
