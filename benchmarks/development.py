@@ -170,8 +170,8 @@ def totals(rows):
                 f"{kind:7s} strict {count(chosen, whole('strict'))}, named {count(chosen, named)},"
                 f" false claim {count(chosen, lambda r: int(r['false']) > 0)}"
             )
-    worse = count(rows, lambda r: r["prediction"] and float(r["prediction"]) > 1.01)
-    near = lambda r: r["error_after"] and float(r["error_after"]) <= 1.1 * float(r["error_floor"])
+    worse = count(rows, lambda r: float(r["prediction"] or 1) > 1.01)
+    near = lambda r: float(r["error_after"] or "inf") <= 1.1 * float(r["error_floor"])
     seconds = [float(r["seconds"]) for r in rows]
     return "\n".join(
         [

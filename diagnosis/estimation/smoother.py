@@ -25,7 +25,6 @@ from diagnosis.simulation.rows import RowMap
 
 BLOCK = 200  # rows that are smoothed as one piece
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
-NEAR = 2  # rows before and after what touches, whose errors tell no noise
 MOST = 10.0  # factor of a variance in one update
 LOUDER = 20.0  # noise is at most so many times what differences of readings show
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
@@ -167,12 +166,11 @@ class Smoother:
         seen = self._seen(off)
         for _ in range(passes):
             free = self._touching(qpos)
-            apart = np.convolve(free, np.ones(2 * NEAR + 1), "same") == 0
             step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
             for _ in range(UPDATES):
-                found = self._smooth(step, qpos, qvel, seen, apart)
-                self._update(found, apart)
-            found = self._smooth(step, qpos, qvel, seen, apart)
+                found = self._smooth(step, qpos, qvel, seen, ~free)
+                self._update(found, ~free)
+            found = self._smooth(step, qpos, qvel, seen, ~free)
             nv, live = self.model.nv, self.live
             state, deviation = (np.empty((len(qpos), 3 * nv)) for _ in range(2))
             state[self.index[live]], deviation[self.index[live]] = (

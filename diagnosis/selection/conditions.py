@@ -11,10 +11,8 @@ import numpy as np
 
 from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND
+from diagnosis.selection.transients import CONCENTRATED, LONGEST
 from diagnosis.selection.unmodelled_force import dependences
-
-CONCENTRATED = 0.8  # of what is beyond the noise, the share that lies where a condition holds
-LONGEST = 0.6  # of all windows: what lasts longer is no condition
 
 
 @dataclass(frozen=True)

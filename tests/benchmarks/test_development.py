@@ -78,5 +78,11 @@ def test_totals_count_trials():
     assert "predicts worse than nominal 1/2, within 1.1 of the truth 2/2" in text
 
 
+def test_totals_count_a_trial_without_an_answer():
+    stopped = row(1, [], exit=-9, prediction="", error_after="")
+    text = development.totals([row(2, [FRICTION]), stopped])
+    assert "predicts worse than nominal 0/2, within 1.1 of the truth 1/2" in text
+
+
 def test_numbers_of_trials():
     assert development.numbers("3,8-10") == {3, 8, 9, 10}
