@@ -45,7 +45,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "differences must be alike": {"diagnosis.selection.criterion:INDEPENDENT": 0.0},
     "forward alone": {"diagnosis.selection.beam:CHANCE": 0.0},
     "no first look": {"diagnosis.selection.first_look:EACH": 10**6},
-    "ten further effects in each first look": {"diagnosis.selection.first_look:EACH": 10},
+    "five further effects in each first look": {"diagnosis.selection.first_look:EACH": 5},
     "no force under a condition": {"diagnosis.selection.conditions:CONCENTRATED": 2.0},
     "no coarse steps": {"diagnosis.simulation.rows:STEPS": 1000},
     "new columns in every step": {"diagnosis.selection.judge:TRUE": -1.0},

@@ -13,7 +13,7 @@ from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
 
 GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
-MORE, EACH = 2, 5  # looks beside the best of those before, more than joints; new ones in each
+MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; new ones in each
 
 
 def likely(missing, starts):
