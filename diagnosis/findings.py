@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from diagnosis.effects.base import is_numerical
 from diagnosis.estimation import prediction_error, windowing
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
@@ -98,10 +99,12 @@ def _findings(world, outcome, bounds, figure):
 
 
 def verdict(findings, something):
-    """match, mismatch, or unresolved: something is missing and no name explains it well enough."""
-    if not findings:
-        return "unresolved" if something else "match"
-    named = findings[0]["effect"] != "unknown" and any(f["adequate"] for f in findings)
+    """match, mismatch, or unresolved: something is missing and no name explains it well enough. A
+    finer time step explains nothing that is missing."""
+    physics = [f for f in findings if not is_numerical(f["effect"])]
+    if not physics:
+        return "unresolved" if something else "mismatch" if findings else "match"
+    named = physics[0]["effect"] != "unknown" and any(f["adequate"] for f in physics)
     return "mismatch" if named else "unresolved"
 
 

@@ -9,7 +9,7 @@ A name stands first only where the error of its joint goes with it. Where much o
 
 import numpy as np
 
-from diagnosis.effects.base import HINGE, JOINT_TRANSMISSIONS, SLIDE
+from diagnosis.effects.base import HINGE, JOINT_TRANSMISSIONS, SLIDE, is_numerical
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND, PRICE
@@ -148,7 +148,7 @@ def _unearned(world, outcome, shares, something):
 def led(world, outcome, findings, something):
     """Findings with `unknown` in the place of names that leave much of the error of their joint or
     have a value at the edge of what was tried, or where something is missing and nothing has a
-    name.
+    name: a finer time step is none.
 
     findings: [(candidate or None, finding)], the most important first.
     """
@@ -171,7 +171,8 @@ def led(world, outcome, findings, something):
             order.append(finding)
         elif joint not in order:
             order.append(joint)
-    joint, on = (None, ()) if order else _unearned(world, outcome, shares, something)
+    physics = [f for f in order if isinstance(f, str) or not is_numerical(f["effect"])]
+    joint, on = (None, ()) if physics else _unearned(world, outcome, shares, something)
     order += [joint] if joint else []
     told = lambda joint: leads.get(joint) or unknown(joint, outcome, on)
     force = lambda joint: beside(told(joint), names.get(joint, []))

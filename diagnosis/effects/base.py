@@ -273,6 +273,11 @@ def turns(model, j):
     return model.jnt_type[j] == HINGE
 
 
+def is_numerical(name):
+    """Whether an effect, by its name, is the simulator's own method and no physics."""
+    return any(effect.numerical for effect in EFFECTS if effect.name == name)
+
+
 def runge_kutta(model):
     """Whether forces are evaluated several times in a step."""
     return model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4)

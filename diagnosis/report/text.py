@@ -91,25 +91,25 @@ def estimate(parameter: dict) -> str:
     return f"{value:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f}){unit}"
 
 
+def _force_words(finding: dict) -> str:
+    """What a force without a name depends on, or how it repeats, as the middle of a sentence."""
+    if (finding.get("curve") or {}).get("wave"):
+        # its parameters are a sine's values a quarter of a period apart
+        one, other = finding["parameters"]
+        hertz = 0.25 / (other["at"] - one["at"])
+        amplitude = math.hypot(one["value"], other["value"])
+        wave = f"repeating {number(hertz)} times a second with an amplitude of"
+        return f", {wave} {number(amplitude)} {one['unit']}"
+    on = depends_words(finding.get("depends_on"))
+    return f", depending on {on}" if on else ""
+
+
 def finding_words(finding: dict) -> str:
     """One finding in a sentence: "joint elbow: Coulomb friction 0.121 ± 0.004 N·m was left out"."""
     place, effect = place_words(finding["place"]), effect_words(finding["effect"])
     if finding["effect"] == "unknown":
-        on, unnamed = (
-            depends_words(finding.get("depends_on")),
-            f"{place}: a force that the catalogue has no name for",
-        )
-        if (finding.get("curve") or {}).get(
-            "wave"
-        ):  # its parameters are a sine's values a quarter of a period apart
-            one, other = finding["parameters"]
-            hertz, amplitude = (
-                0.25 / (other["at"] - one["at"]),
-                math.hypot(one["value"], other["value"]),
-            )
-            wave = f"repeating {number(hertz)} times a second with an amplitude of"
-            return f"{unnamed}, {wave} {number(amplitude)} {one['unit']}"
-        return unnamed + (f", depending on {on}" if on else "") + when_words(finding.get("when"))
+        unnamed = f"{place}: a force that the catalogue has no name for"
+        return unnamed + _force_words(finding) + when_words(finding.get("when"))
     parameters, ends = finding["parameters"], ""
     absent = [
         p for p in parameters if no_stop(p["name"], p["value"]) and no_stop(p["name"], p["nominal"])

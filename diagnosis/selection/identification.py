@@ -128,12 +128,7 @@ class Identification:
             judged.append(fitted)
             if not fitted.settled:  # what has no value may hide others that have
                 judged.append(judge.fit(fitted.inside, steps=3))
-        best = self._choose(judged, now)
-        if best is not now:
-            best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
-            self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
-        elif len(setting) > 1:  # chosen along a motion that was another one
-            best = self.pruned(judge, now, judge.fit({}))
+        best = self._ended(judge, self._choose(judged, now), now)
         better = best.setting.keys() != setting.keys()
         return best, better, [] if setting else self._ranking(beam, start, nodes)
 
@@ -200,6 +195,16 @@ class Identification:
             return fitted
         more = judge.fit({**fitted.setting, step: tuple(p.low for p in step.parameters)}, steps=3)
         return more if more.loss < fitted.loss else fitted
+
+    def _ended(self, judge, best, now):
+        """What a round ends with: the best set without what it does not need, or what there was
+        without what is needed no more. That was chosen along the motion of another set."""
+        if best is not now:
+            best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
+            self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
+        elif len(now.setting) > 1:
+            best = self.pruned(judge, now, judge.fit({}))
+        return best
 
     def earned(self, before, after):
         """Whether a set is worth its complexity, and better by no chance among those looked at: an

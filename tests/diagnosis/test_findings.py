@@ -64,6 +64,11 @@ def test_a_mismatch_is_led_by_a_name_and_has_one_that_is_adequate():
     assert findings.verdict([name(False), name(True)], something=True) == "mismatch"
     assert findings.verdict([name(False)], something=True) == "unresolved"
     assert findings.verdict([unknown, name(True)], something=True) == "unresolved"
+    finer = {"effect": "time_step", "adequate": True}
+    assert findings.verdict([finer], something=True) == "unresolved"
+    assert findings.verdict([finer], something=False) == "mismatch"
+    assert findings.verdict([finer, name(True)], something=True) == "mismatch"
+    assert findings.verdict([finer, name(False)], something=True) == "unresolved"
 
 
 def test_a_value_that_is_changed_is_told_though_no_interval_is_known():

@@ -143,6 +143,14 @@ def test_where_nothing_has_a_name_the_joint_that_stands_out_is_told():
     assert unnamed.led(WORLD, both, [], False) == []
 
 
+def test_a_finer_time_step_is_no_name():
+    finer = {"effect": "time_step", "place": {"kind": "world", "name": "world"}}
+    loud = outcome(smoothed(0.3, shoulder=0.9))
+    kept, force = unnamed.led(WORLD, loud, [(None, finer)], True)
+    assert kept == finer and force["place"]["name"] == "shoulder"
+    assert unnamed.led(WORLD, loud, [(None, finer)], False) == [finer]
+
+
 def test_a_force_without_a_name_is_told_only_where_a_perfect_model_is_worth_its_price():
     price = PRICE * unnamed.UNNAMED
     places = lambda room: [
