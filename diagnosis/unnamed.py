@@ -152,7 +152,8 @@ def led(world, outcome, findings, something):
 
     findings: [(candidate or None, finding)], the most important first.
     """
-    leads = {f["place"]["name"]: f for _, f in findings if f["effect"] == "unknown"}
+    # of two at a joint the more important one: what acts at times may stand beside a curve
+    leads = {f["place"]["name"]: f for _, f in reversed(findings) if f["effect"] == "unknown"}
     order, shares = [], left(outcome.fitted)  # findings, and the joints of unknown forces
     names = {}  # that these may have
     for candidate, finding in findings:

@@ -135,6 +135,13 @@ def test_a_curve_that_was_found_leads_the_names_at_its_joint():
     assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
 
 
+def test_of_two_unknown_forces_at_a_joint_the_more_important_one_is_told():
+    curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))
+    first, second = (finding(curve, removed)[1] for removed in (0.4, 0.0))
+    [only] = unnamed.led(WORLD, outcome(smoothed(0.1)), [(None, first), (None, second)], True)
+    assert only["evidence"]["held_out_error_removed"] == 0.4
+
+
 def test_where_nothing_has_a_name_the_joint_that_stands_out_is_told():
     both = outcome(smoothed(0.3, shoulder=0.9), depends=DEPENDS)
     [only] = unnamed.led(WORLD, both, [], True)
