@@ -20,6 +20,7 @@ from diagnosis.selection.conditions import concentrated
 from diagnosis.selection.criterion import PRICE, complexity, paired
 from diagnosis.selection.event import Event
 from diagnosis.selection.identification import (
+    LEVEL,
     Found,
     Identification,
     changing,
@@ -117,25 +118,29 @@ def _checked(search, found, fitted, others, log):
 
 def _sometimes(search, found, fitted, log):
     """The Event of a force that is missing beside a Fitted set under a condition only, or None."""
-    where = concentrated(fitted)
+    judge, where = found.judge, concentrated(fitted)
     rest = where and where.dependence(search.world, found.trajectory, search.train)
-    beside = rest and _beside(search, found.judge, fitted, rest, PRICE * UNNAMED, where.number)
-    if not beside:
+    if not rest:
         return None
+    beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=0)
+    step = paired(fitted.score, beside.score)  # of the one curve that is asked
+    if step.gain < PRICE * UNNAMED or step.p_value > LEVEL:
+        return None
+    beside = search.further(judge, beside)
     losses = f"{fitted.loss:.3f} -> {beside.loss:.3f}"
     log(f"  {rest.variables} at times: {rest.candidate.when} {losses}")
-    values, p = beside.setting[rest.candidate], paired(fitted.score, beside.score).p_value
-    told = rest.candidate, values, where.recording, where.time, min(p * where.number, 1.0)
+    values = beside.setting[rest.candidate]
+    told = rest.candidate, values, where.recording, where.time, where.p_value
     return Event(*told, low=values, high=values, removed=where.removed(fitted, beside))
 
 
-def _beside(search, judge, fitted, rest, price, number=1):
+def _beside(search, judge, fitted, rest, price):
     """The Fitted set with a curve beside, or None where it does not earn its place: as it was
-    located, and then refitted. number: of conditions that it was chosen from."""
+    located, and then refitted."""
     for steps in (0, 2):
         beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=steps)
         step = paired(fitted.score, beside.score)
-        if step.gain < price or not search.no_chance(step, number=number):
+        if step.gain < price or not search.no_chance(step):
             return None
     return beside
 

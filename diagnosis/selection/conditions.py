@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from diagnosis.common.distributions import f_sf
 from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND
+from diagnosis.selection.identification import LEVEL
 from diagnosis.selection.transients import CONCENTRATED, LONGEST
 from diagnosis.selection.unmodelled_force import dependences
 
@@ -18,12 +20,12 @@ from diagnosis.selection.unmodelled_force import dependences
 @dataclass(frozen=True)
 class Condition:
     """recording: None for every one; time: (from, to), s; inside (W,): in which windows it holds;
-    number: how many were compared."""
+    p_value: that these err more than the others by chance, corrected for all that were compared."""
 
     recording: object
     time: tuple
     inside: np.ndarray
-    number: int
+    p_value: float
 
     @property
     def when(self):
@@ -62,14 +64,19 @@ def _squares(fitted):
 
 def concentrated(fitted):
     """The Condition under which most is left of what a Fitted set does not explain, for the share
-    of the windows that it holds in; None where no such one holds what is left."""
-    excess = np.maximum(_squares(fitted) - BEYOND**2, 0.0)
+    of the windows that it holds in; None where no such one holds what is left, or where chance may
+    have made its windows err so much more than the others: an F-test, each window as one error."""
+    squares = _squares(fitted)
+    excess = np.maximum(squares - BEYOND**2, 0.0)
     some = [c for c in _conditions(fitted.columns.ahead.windows) if c[-1].mean() <= LONGEST]
     if not some or not excess.any():
         return None
     share = [excess[inside].sum() / excess.sum() for *_, inside in some]
     best = int(np.argmax([s - inside.mean() for s, (*_, inside) in zip(share, some)]))
-    return Condition(*some[best], len(some)) if share[best] >= CONCENTRATED else None
+    inside = some[best][-1]
+    ratio = squares[inside].mean() / squares[~inside].mean()
+    p = float(f_sf(ratio, inside.sum(), (~inside).sum())) * len(some)
+    return Condition(*some[best], p) if share[best] >= CONCENTRATED and p < LEVEL else None
 
 
 def _conditions(windows):

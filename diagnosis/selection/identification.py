@@ -213,11 +213,11 @@ class Identification:
         added = len(after.setting.keys() - before.setting.keys())
         return after.loss < before.loss and self.no_chance(step, added)
 
-    def no_chance(self, step, added=1, number=1):
+    def no_chance(self, step, added=1):
         """Whether a Comparison is significant among all sets of so many different columns, with two
-        tests each, under so many conditions."""
+        tests each."""
         sets = self.looked**added / factorial(added)
-        return step.p_value < LEVEL / max(sets, self.looked) / number / 2
+        return step.p_value < LEVEL / max(sets, self.looked) / 2
 
     def pruned(self, judge, fitted, now):
         """Without the effects that do not earn their place beside the others, as long as what stays
