@@ -159,8 +159,7 @@ class Chain(Ahead):
 
     def _rows(self, setting, rows):
         t = self.trajectory
-        world = self.world.quick if setting.items() >= self.coarse.items() else self.world
-        self.map = RowMap(world, list(t.first), setting, like=self.map)
+        self.map = RowMap(self.world, list(t.first), setting, like=self.map)
         index, none = np.searchsorted(self.map.begin, rows), np.zeros((len(rows), self.model.nv))
         qpos, qvel = self.map.ahead(index, t.qpos[rows], t.qvel[rows], none)
         gap = windowing.difference(self.model, qpos, t.qpos[rows + 1])
