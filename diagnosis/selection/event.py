@@ -40,7 +40,11 @@ class Event:
 
 
 class Windows:
-    """Residuals of windows in noises, with what their start states explain taken out."""
+    """Residuals of windows in noises, with what their start states explain taken out.
+
+    plain (W, rows): what the setting leaves; rough (W, rows): its residual as quick simulations
+    have it, start states left in.
+    """
 
     def __init__(self, world, setting, windows, trajectory, noise):
         """trajectory: a smoother.Trajectory under the setting; noise (nv,): of the positions."""
@@ -49,15 +53,17 @@ class Windows:
         self.measured, self.noise = windowing.measured(windows), noise
         self.residual = self._raw(world, [setting])[0]
         small = np.concatenate([1e-5 * np.ones_like(noise), 1e-4 * np.ones_like(noise)])
-        plain = self._raw(world.quick, [setting])[0]
+        same = world.quick is world
+        self.rough = self.residual if same else self._raw(world.quick, [setting])[0]
         slopes = [
-            (self._raw(world.quick, [setting], eps * unit)[0] - plain) / eps
+            (self._raw(world.quick, [setting], eps * unit)[0] - self.rough) / eps
             for eps, unit in zip(small, np.eye(len(small)))
         ]
         self.known = self.residual != 0
         # of each window its own basis: orthonormal columns (W, rows, 2 nv)
         self.basis = np.linalg.qr(np.stack(slopes, -1))[0]
         self.rows = np.maximum(self.known.sum(1) - self.basis.shape[-1], 1)
+        self.plain = self._beside(self.residual[None])[0]
 
     def _raw(self, world, settings, moved=None):
         """Measured less predicted in noises, (settings, W, rows); 0 where either is missing."""
@@ -80,8 +86,7 @@ class Windows:
 
     def changes(self, settings):
         """What settings change of that, (settings, W, rows): differences of quick simulations."""
-        plain, *moved = self._raw(self.world.quick, [self.setting, *settings])
-        return self._beside(plain - np.array(moved))
+        return self._beside(self.rough - self._raw(self.world.quick, settings))
 
     def _beside(self, raw):
         explained = np.einsum("wrk,swr->swk", self.basis, raw)
@@ -127,7 +132,7 @@ class Local:
             longer += windowing.consecutive(r, LONGER * SPAN, near[0].first, near[-1].last + 1)
         self.scene, self.chi2, self.inside = scene, chi2, inside
         self.local = Windows(scene.world, scene.setting, longer, trajectory, scene.noise)
-        self.around = float((self.local.left([scene.setting]) ** 2).sum())
+        self.around = float((self.local.plain**2).sum())
         self.recording = recordings[0] if len(recordings) == 1 else None
         begin = min(w.recording.time[w.first] for w in within)
         end = max(w.recording.time[w.last if self.recording else -1] for w in within)
@@ -216,7 +221,7 @@ class Local:
             for curve in curves
             if "time" not in curve.variables and curve.share >= LASTING
         ]
-        plain = scene.left([scene.setting])[0]
+        plain = scene.plain
         for other in every + ([setting] if setting else []):
             column = plain - scene.left([other])[0]
             if (column * plain).sum() ** 2 > LASTING * gain * max((column**2).sum(), 1e-300):

@@ -53,7 +53,7 @@ def find(world, recordings, setting, trajectory, noise, lasting=None):
     first = max(0, min(_loudest(trajectory, windows) - MOST // 2, number - MOST))
     noise = np.where(np.isfinite(noise), np.maximum(noise, 1e-12), 1.0)
     scene = Windows(world, setting, windows[first:][:MOST], trajectory, noise)
-    chi2 = (scene.left([setting])[0] ** 2).sum(1)
+    chi2 = (scene.plain**2).sum(1)
     each = chi2 / scene.rows
     usual = np.median(each)
     looks, spans = _looks(scene), _spans(scene.windows)
@@ -99,7 +99,7 @@ def _looks(scene):
     """The Looks of every effect that may come and go: pushes, and changes of a mass."""
     world, setting, out = scene.world, scene.setting, []
     by = {(c.effect.name, c.place): c for c in world.candidates}
-    plain = scene.left([setting])[0]
+    plain = scene.plain
     for timed in world.candidates:
         name = STEADY.get(timed.effect.name)
         if (name, timed.place) not in by:

@@ -24,7 +24,7 @@ def runs(*pushes):
 
 
 def search(*pushes):
-    """(Identification, what is left of the nominal model, Fitted)."""
+    """(Identification without candidates, its Found: the nominal model)."""
     here = Identification(World(mujoco.MjSpec.from_string(XML)), runs(*pushes))
     here.candidates = []
     return here, here.run()
