@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diagnosis import findings
+from diagnosis.estimation.intervals import intervals
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
@@ -117,9 +118,40 @@ def _checked(search, found, fitted, others, log):
 
 
 def _sometimes(search, found, fitted, log):
-    """The Event of a force that is missing beside a Fitted set under a condition only, or None."""
-    judge, where = found.judge, concentrated(fitted)
-    rest = where and where.dependence(search.world, found.trajectory, search.train)
+    """The Event of what is missing beside a Fitted set under a condition only, or None: the effect
+    that a search finds where it holds, or the curve that the located force follows there."""
+    where = concentrated(fitted)
+    if not where:
+        return None
+    return _named_there(search, found, fitted, where, log) or _curve_there(
+        search, found, fitted, where, log
+    )
+
+
+def _named_there(search, found, fitted, where, log):
+    """The Event of the effect that a search finds beside a Fitted set where a Condition holds."""
+    world, judge = search.world, found.judge
+    there = Identification(world, where.parts(search.train), log=log)
+    inside = there.run(fitted.setting)
+    best, others = _classes(there, inside, inside.fitted, log, there.candidates)
+    new = [c for c in best.setting if c not in fitted.setting and not c.effect.numerical]
+    if not new:
+        return None
+    most = max(new, key=lambda c: without(best, c).loss)
+    placed, values = where.placed(world, most), best.setting[most]
+    beside = judge.fit({**fitted.setting, placed: values}, steps=0)
+    log(f"  {placed} {fitted.loss:.3f} -> {beside.loss:.3f}")
+    if beside.loss >= fitted.loss:
+        return None
+    low, high = zip(*(b or (v, v) for b, v in zip(intervals(best)[most], values)))
+    told = placed, values, where.recording, where.time, where.p_value
+    also = tuple((where.placed(world, c), v) for c, v in others.get(most, ()))
+    return Event(*told, low=low, high=high, removed=where.removed(fitted, beside), others=also)
+
+
+def _curve_there(search, found, fitted, where, log):
+    """The Event of a force without a name that the located force follows there."""
+    judge, rest = found.judge, where.dependence(search.world, found.trajectory, search.train)
     if not rest:
         return None
     beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=0)

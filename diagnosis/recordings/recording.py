@@ -57,16 +57,14 @@ class Recording:
 
     def seen(self):
         """The rows from `start` on, as a Recording of their own."""
-        rows = slice(self.start, None)
-        return replace(
-            self,
-            time=self.time[rows],
-            qpos=self.qpos[rows],
-            qvel=self.qvel[rows],
-            ctrl=self.ctrl[rows],
-            sensors={name: values[rows] for name, values in self.sensors.items()},
-            start=0,
-        )
+        return self.part(self.start, None)
+
+    def part(self, first, end):
+        """Rows first to end, without that, as a Recording of their own."""
+        rows = slice(first, end)
+        fields = {f: getattr(self, f)[rows] for f in ("time", "qpos", "qvel", "ctrl")}
+        sensors = {name: values[rows] for name, values in self.sensors.items()}
+        return replace(self, **fields, sensors=sensors, start=0)
 
 
 def load(paths, model, layout=Layout()):

@@ -64,19 +64,30 @@ class Columns:
     """Simulates the columns of starts about a setting. residual (W, T, nv); array (W, T, nv, K);
     options."""
 
-    def __init__(self, ahead, setting, starts, residual=None, seen=None):
+    def __init__(self, ahead, setting, starts, residual=None, seen=None, known=None):
         """residual: of the setting, if it is known; seen: {candidate: which of its parameters
-        show}, kept up to date."""
+        show}, kept up to date; known: other Columns, whose effects' are taken as if they were the
+        same here."""
         self.ahead, self.setting, self.world = ahead, setting, ahead.world
         self.options, self.simulated = [], int(residual is None)
         self.seen = {} if seen is None else seen
         self.residual = ahead.residual([setting])[0] if residual is None else residual
-        self.rough = self.residual
-        if not ahead.same(setting):
-            self.rough = ahead.rough([setting])[0]
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
         self.parts, self.begun = [], []  # the Start of every option
-        self._simulate(starts)
+        if known:
+            self._take(known)
+        mine = {option.candidate for option in self.options}
+        self._simulate([start for start in starts if start.candidate not in mine])
+
+    def _take(self, known):
+        """The columns that others have of the setting's effects."""
+        for option, begun in zip(known.options, known.begun):
+            if option.candidate in self.setting:
+                first, old = len(self.parts), option.columns
+                self.parts += [known.parts[i] for i in old]
+                option = option.about(self.setting[option.candidate])
+                self.options.append(replace(option, columns=(*range(first, first + len(old)),)))
+                self.begun.append(begun)
 
     def about(self, setting, residual):
         """These Columns about other values of the setting's effects, whose residual is known."""
@@ -100,8 +111,11 @@ class Columns:
         physics = [start for start in starts if not numerical(start)]
         physics = sorted(physics, key=lambda start: stepwise(self.world, start.candidate))
         steps, ahead = [*filter(numerical, starts)], self.ahead
+        rough = self.residual
+        if physics and not ahead.same(self.setting):
+            rough = ahead.rough([self.setting])[0]
         changes = iter(
-            self._changes(ahead.rough, self.rough, physics)
+            self._changes(ahead.rough, rough, physics)
             + self._changes(ahead.residual, self.residual, steps)
         )
         starts = physics + steps

@@ -13,7 +13,7 @@ from diagnosis.common.distributions import f_sf
 from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND
 from diagnosis.selection.identification import LEVEL
-from diagnosis.selection.transients import CONCENTRATED, LONGEST
+from diagnosis.selection.transients import CONCENTRATED, LONGEST, STEADY
 from diagnosis.selection.unmodelled_force import dependences
 
 
@@ -38,6 +38,20 @@ class Condition:
         own = [self.recording in (None, r) for r in recordings]
         inside = lambda t: (self.time[0] <= t) & (t <= self.time[1])
         return np.concatenate([yes & inside(r.time) for yes, r in zip(own, recordings)])
+
+    def parts(self, recordings):
+        """The recordings while it holds."""
+        within = lambda r: np.searchsorted(r.time, self.time)
+        some = [(r, *within(r)) for r in recordings if self.recording in (None, r)]
+        return [r.part(a, b + 1) for r, a, b in some if b - a > 8]
+
+    def placed(self, world, candidate):
+        """An effect that acts only while it holds: a mass that comes is a load."""
+        name, place = candidate.effect.name, candidate.place
+        coming = (
+            c for c in world.candidates if c.place == place and name == STEADY.get(c.effect.name)
+        )
+        return world.localised(next(coming, candidate), self.when)
 
     def dependence(self, world, trajectory, recordings):
         """The Dependence of the located force there, acting there only; None where it follows

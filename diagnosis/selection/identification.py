@@ -61,15 +61,17 @@ class Identification:
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
         ]
 
-    def run(self):
-        """The Found of all rounds."""
+    def run(self, setting=None):
+        """The Found of all rounds, begun with the nominal model, or with a setting."""
         self.say(0.0, "locating the missing force")
         self.smoother = smoother = Smoother(self.world, self.train)
         first = trajectory = smoother.locate({})
+        setting, ranking = setting or {}, []
+        if setting:
+            trajectory = smoother.locate(setting, first, passes=1)
         self.usual = Usual(self.world, self.train, smoother.scale, first.located()[0])
         self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
         self.screen = Chain(self.world, self.ahead.windows, smoother.position_noise)
-        setting, ranking = {}, []
         for i in range(ROUNDS):
             self.ahead.start(trajectory, setting)
             self.screen.start(trajectory, setting)
@@ -121,13 +123,13 @@ class Identification:
         now = judge.fit(setting)
         judged = [now]
         for node in self._finalists(beam, start, nodes):
-            fitted = judge.fit(beam.setting(node), steps=3)
+            fitted = judge.fit(beam.setting(node), steps=3, near=now)
             p = paired(now.score, fitted.score).p_value
             losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
             self.log(f"  {losses} {'' if fitted.settled else '(limit) '}{said(fitted.setting)}")
             judged.append(fitted)
             if not fitted.settled:  # what has no value may hide others that have
-                judged.append(judge.fit(fitted.inside, steps=3))
+                judged.append(judge.fit(fitted.inside, steps=3, near=fitted))
         best = self._ended(judge, self._choose(judged, now), now)
         better = best.setting.keys() != setting.keys()
         return best, better, [] if setting else self._ranking(beam, start, nodes)
@@ -193,7 +195,8 @@ class Identification:
         step = self.world.candidate("time_step", "world")
         if step in fitted.setting:
             return fitted
-        more = judge.fit({**fitted.setting, step: tuple(p.low for p in step.parameters)}, steps=3)
+        least = tuple(p.low for p in step.parameters)
+        more = judge.fit({**fitted.setting, step: least}, steps=3, near=fitted)
         return more if more.loss < fitted.loss else fitted
 
     def _ended(self, judge, best, now):
@@ -225,7 +228,7 @@ class Identification:
         small changes show to be needed are not tried without."""
         while len(fitted.setting) > 1:
             tries = [
-                judge.fit({c: v for c, v in fitted.setting.items() if c is not out}, steps=3)
+                judge.fit({c: v for c, v in fitted.setting.items() if c is not out}, 3, fitted)
                 for out in self._missed_least(fitted)
             ]
             tries = [f for f in tries if self.earned(now, f)]
@@ -235,7 +238,7 @@ class Identification:
                 self.log(f"  without: {less.loss:.3f} {said(less.setting)}; p {step.p_value:.2g}")
             if less is None or self.earned(less, fitted):
                 break
-            fitted = less
+            fitted = judge.fit(less.setting)
         return fitted
 
     def _missed_least(self, fitted):

@@ -57,33 +57,36 @@ class Judge:
         self.ahead, self.usual, self.reference = ahead, usual, reference
         self.seen = {} if seen is None else seen
 
-    def fit(self, setting, steps=STEPS):
+    def fit(self, setting, steps=STEPS, near=None):
         """The Fitted values of a set of effects, begun at the values given.
 
         Columns are carried along with steps that do what they told, and simulated again after
         others, where they lower the loss no more, and at the end: of a set of many effects they are
-        most of the time.
+        most of the time. near: a Fitted set, whose columns stand for those of the effects that it
+        shares as well, also at the end: enough for a comparison.
         """
-        columns, carried = self._columns({c: self._inside(c, v) for c, v in setting.items()}), False
+        inside = {c: self._inside(c, v) for c, v in setting.items()}
+        columns, carried = self._columns(inside, near=near), near is not None
         while True:
             evidence = columns.evidence(self.reference)
             index, *rest = problem(columns, range(len(columns.options)))
-            score, better, as_told = evidence.score(index, *rest), None, False
+            score, better, as_told = evidence.score(index, *rest), None, True
             if steps:
                 better, as_told = self._better(columns, evidence, index, score.amounts)
-            if not better and not carried:
+            if not better and (not carried or (near and as_told)):
                 break
             moved = better or (columns.setting, columns.residual)
-            carried, steps = as_told, steps - bool(better)
+            carried, steps = bool(better) and as_told, steps - bool(better)
             columns = columns.about(*moved) if carried else self._columns(*moved)
         self.reference = evidence.reference
         score = score.plus(self.cost(columns.setting), evidence.number)
         return Fitted(columns.setting, score, columns, evidence)
 
-    def _columns(self, setting, residual=None):
-        """Those of a setting's effects, about it."""
+    def _columns(self, setting, residual=None, near=None):
+        """Those of a setting's effects, about it; near: a Fitted set that has some of them."""
+        known = near.columns if near else None
         starts = Starts(self.ahead.world, setting, self.usual, self.seen).of(setting)
-        return Columns(self.ahead, setting, starts, residual, self.seen)
+        return Columns(self.ahead, setting, starts, residual, self.seen, known)
 
     def _better(self, columns, evidence, index, amounts):
         """((setting, residual) after a step from a setting that its Columns lower the loss with, or
@@ -91,7 +94,7 @@ class Judge:
         now = evidence.plain()
         told = now - evidence.plain(index, amounts)
         if told <= DONE:
-            return None, False
+            return None, True
         now += self._prior(columns.setting, evidence)
         return self._lower(columns, evidence, amounts, now, told)
 

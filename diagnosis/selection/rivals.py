@@ -61,7 +61,7 @@ def _members(candidates, judge, before, fitted, candidate):
     alike = _alike(judge, missing, fitted, candidate, pool)
     near += [(other, values) for other, values in alike if other not in twins]
     for other, values in near[:REFITS]:
-        tried = judge.fit({**rest, other: values}, steps=2)
+        tried = judge.fit({**rest, other: values}, steps=2, near=fitted)
         if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
             continue
         tried = judge.fit(tried.setting)  # forces tell values better than the motion

@@ -175,14 +175,7 @@ def quiet(recording, event):
 def calm(recordings, event):
     """The recordings without the time of an event, each stretch a Recording of its own."""
     return [
-        r if (a, b) == (r.start, len(r.time)) else _part(r, a, b)
+        r if (a, b) == (r.start, len(r.time)) else r.part(a, b)
         for r in recordings
         for a, b in quiet(r, event)
     ]
-
-
-def _part(recording, a, b):
-    rows = slice(a, b)
-    fields = {f: getattr(recording, f)[rows] for f in ("time", "qpos", "qvel", "ctrl")}
-    sensors = {name: values[rows] for name, values in recording.sensors.items()}
-    return replace(recording, **fields, sensors=sensors, start=0)

@@ -1,5 +1,5 @@
-"""A drag that no name holds, in one recording of three or from some moment on, is told with where
-it acts; where it acts always, or nothing does, no condition is."""
+"""A drag that is there in one recording of three or from some moment on is told with where it acts,
+by its name if it has one; where it acts always, or nothing does, no condition is."""
 
 import mujoco
 import numpy as np
@@ -58,10 +58,33 @@ def test_rows_of_a_condition_are_those_of_its_recordings_in_its_time():
     assert one[400:].all() and not one[:400].any()
 
 
+def test_parts_of_a_condition_are_its_recordings_in_its_time():
+    two = runs(None, None)
+    parts = Condition(None, (1.0, 4.0), np.ones(1), 1).parts(two)
+    assert [(r.name, r.time[0], len(r.time)) for r in parts] == [
+        ("0.csv", pytest.approx(1.0), 300),
+        ("1.csv", pytest.approx(1.0), 300),
+    ]
+    (one,) = Condition(two[1], (0.0, 4.0), np.ones(1), 1).parts(two)
+    assert one.name == "1.csv" and (one.qpos == two[1].qpos).all()
+
+
+def test_a_mass_that_comes_is_a_load():
+    world, where = World(mujoco.MjSpec.from_string(XML)), Condition(None, (1.0, 4.0), np.ones(1), 1)
+    placed = lambda effect, place: where.placed(world, world.candidate(effect, place))
+    load, drag = placed("mass", "arm"), placed("viscous_damping", "pivot")
+    assert load.effect.name == "payload_change" and load.place.name == "arm"
+    assert drag.effect.name == "viscous_damping" and load.when == drag.when == where.when
+
+
+def first(recordings, **how):
+    """The first finding of a diagnosis."""
+    world, held = World(mujoco.MjSpec.from_string(XML)), [recorded("held.csv", 9, **how)]
+    return identify(world, recordings, held).summary["findings"][0]
+
+
 def told(*pushes):
-    world = World(mujoco.MjSpec.from_string(XML))
-    held = [recorded("held.csv", 9, push=pushes[0])]
-    return identify(world, runs(*pushes), held).summary["findings"][0]
+    return first(runs(*pushes), push=pushes[0])
 
 
 def test_a_drag_in_one_recording_is_told_as_unknown_there():
@@ -71,6 +94,14 @@ def test_a_drag_in_one_recording_is_told_as_unknown_there():
     assert finding["when"]["recording"] == "1.csv"
     assert finding["evidence"]["error_removed_there"] > 0.5
     assert finding["evidence"]["p_value"] < 1e-3
+
+
+def test_a_drag_that_has_a_name_is_told_by_it():
+    finding = first([recorded(f"{k}.csv", k, damping=0.1 if k == 1 else 0.05) for k in range(3)])
+    assert finding["effect"] == "viscous_damping" and finding["place"]["name"] == "pivot"
+    assert finding["when"]["recording"] == "1.csv" and finding["adequate"]
+    (value,) = finding["parameters"]
+    assert value["value"] == pytest.approx(0.1, rel=0.05) and value["low"] < 0.1 < value["high"]
 
 
 def test_a_drag_in_all_of_them_has_no_condition():

@@ -82,7 +82,7 @@ def test_an_effect_of_a_set_is_one_of_many_that_were_looked_at(search, share, ke
     less.score = Score(groups.mean(), groups, np.zeros(16), ())
     less.loss = less.score.loss + PRICE * identification.complexity(less.setting)
     monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[:1])
-    judge = SimpleNamespace(fit=lambda setting, steps: less)
+    judge = SimpleNamespace(fit=lambda setting, *how: less)
     now = fitted(search, [], 2.0)
     assert search.pruned(judge, both, now) is (both if kept else less)
 
@@ -111,7 +111,7 @@ def test_what_is_earned_only_together_stays(search, monkeypatch):
     noisy = alone.score.groups + odd
     alone.score = Score(alone.score.loss, noisy, np.zeros(16), ())
     monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[:1])
-    judge = SimpleNamespace(fit=lambda setting, steps: alone)
+    judge = SimpleNamespace(fit=lambda setting, *how: alone)
     assert search.earned(now, both)
     assert not search.earned(alone, both) and not search.earned(now, alone)
     assert search.pruned(judge, both, now) is both
@@ -122,7 +122,7 @@ def test_a_round_without_anything_new_drops_what_is_needed_no_more(search, monke
     now = fitted(search, ["coulomb_friction", "viscous_damping"], -1.0)
     alone = fitted(search, ["coulomb_friction"], -0.99)
     nominal = fitted(search, [], 0.0)
-    judge = SimpleNamespace(fit=lambda setting, steps=6: alone if setting else nominal)
+    judge = SimpleNamespace(fit=lambda setting, *how: alone if setting else nominal)
     monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[1:])
     assert not search.earned(alone, now) and search.earned(nominal, alone)
     assert search._ended(judge, now, now) is alone
@@ -148,7 +148,7 @@ def test_a_finer_time_step_stands_beside_what_was_chosen_where_that_is_better(se
     first = fitted(search, ["coulomb_friction"], -1.0)
     step, asked = search.world.candidate("time_step", "world"), []
     finer = SimpleNamespace(setting={**first.setting, step: (0.001,)}, loss=loss)
-    judge = SimpleNamespace(fit=lambda setting, steps: asked.append(setting) or finer)
+    judge = SimpleNamespace(fit=lambda setting, steps, near: asked.append(setting) or finer)
     assert search.finer(judge, first) is (finer if kept else first)
     assert asked == [{**first.setting, step: (step.nominal[0] / 4,)}]
     assert search.finer(judge, finer) is finer and len(asked) == 1

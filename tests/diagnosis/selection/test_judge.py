@@ -154,15 +154,19 @@ def test_a_step_is_taken_as_far_as_it_lowers_the_loss(monkeypatch, told, losses,
 
 
 @pytest.mark.parametrize(
-    "turns, simulated",
+    "near, turns, simulated",
     [
-        ([("a", True), ("b", True)], ["", "b"]),  # carried along, and anew at the end
-        ([("a", False), ("b", False)], ["", "a", "b"]),  # they told of other steps than these
-        ([("a", True), (None, False), (None, False)], ["", "a"]),  # told nothing: asked anew
-        ([(None, False)], [""]),
+        (None, [("a", True), ("b", True)], ["", "b"]),  # carried along, and anew at the end
+        (None, [("a", False), ("b", False)], ["", "a", "b"]),  # they told of other steps
+        (None, [("a", True), (None, True), (None, True)], ["", "a"]),  # told nothing: asked anew
+        (None, [(None, True)], [""]),
+        ("look", [("a", True), ("b", True)], [""]),  # enough for a comparison
+        ("look", [("a", False), ("b", True)], ["", "a"]),
+        ("look", [("a", True), (None, False), (None, True)], ["", "a"]),  # what they told was wrong
+        ("look", [(None, True)], [""]),
     ],
 )
-def test_columns_are_carried_along_with_steps_that_do_what_they_told(turns, simulated):
+def test_columns_are_carried_along_with_steps_that_do_what_they_told(near, turns, simulated):
     judge, turns, asked = object.__new__(Judge), iter(turns), []
 
     def about(setting, residual=None):
@@ -172,7 +176,7 @@ def test_columns_are_carried_along_with_steps_that_do_what_they_told(turns, simu
         columns.evidence, columns.about = lambda reference: told, about
         return columns
 
-    def columns_of(setting, residual=None):
+    def columns_of(setting, residual=None, near=None):
         asked.append("".join(setting))
         return about(setting, residual)
 
@@ -182,7 +186,7 @@ def test_columns_are_carried_along_with_steps_that_do_what_they_told(turns, simu
 
     judge.reference, judge._columns, judge._better = None, columns_of, better
     judge.cost = lambda setting: 0.0
-    judge.fit({}, steps=2)
+    judge.fit({}, steps=2, near=near)
     assert asked == simulated
 
 
@@ -193,7 +197,7 @@ def test_a_step_is_tried_where_small_changes_tell_of_a_gain(after, asked):
     judge._prior = lambda setting, evidence: 0.0
     judge._lower = lambda *given: told.append(given[-1]) or ("step", True)
     better = judge._better(SimpleNamespace(setting={}), evidence, [0], np.ones(1))
-    assert better == (("step", True) if asked else (None, False))
+    assert better == (("step", True) if asked else (None, True))
     assert told == asked
 
 

@@ -28,7 +28,7 @@ def chosen(monkeypatch, fitted, losses):
     names = {c.name: c for c in (DRY, CURVED)}
 
     class Judge:
-        def fit(self, setting, steps=0):
+        def fit(self, setting, steps=0, near=None):
             (c,) = setting
             units = c.effect.simplicity + 1
             loss = losses[c.name]
@@ -77,7 +77,7 @@ def test_the_same_effect_in_a_like_place_is_tried_at_the_findings_own_value(monk
     elsewhere.nominal = other.nominal = (50.0,)
     begun = []
     judge = SimpleNamespace(
-        fit=lambda setting, steps=0: begun.append(setting) or SimpleNamespace(settled=False)
+        fit=lambda setting, **how: begun.append(setting) or SimpleNamespace(settled=False)
     )
     monkeypatch.setattr(rivals, "_alike", lambda *args: [(other, (5.0,)), (ground, (362.0,))])
     monkeypatch.setattr(rivals, "_near", lambda *args: [ground, elsewhere, other])
