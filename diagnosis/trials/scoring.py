@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-TOLERANCE = 0.05  # of a true value, or of its change from the nominal one
+TOLERANCE = 0.05  # of a true value, or, where that is zero, of its change from the nominal one
 LONGEST_CLASS = 3  # names that a finding may give besides its own
 MOST_VARIABLES = 3  # that an `unknown` may claim to depend on
 
@@ -47,10 +47,11 @@ class ValueScore:
 
     @property
     def near(self):
-        """Within 5 % of the truth."""
+        """Within 5 % of the truth; of what a truth of zero lacks, within 5 % of that."""
         if self.value is None or not math.isfinite(self.value):
             return False
-        return abs(self.value - self.truth) <= TOLERANCE * abs(self.truth)
+        size = abs(self.truth) or abs(self.nominal or 0.0)
+        return abs(self.value - self.truth) <= TOLERANCE * size
 
     @property
     def held(self):

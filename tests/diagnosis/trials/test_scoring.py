@@ -112,6 +112,13 @@ def test_values_within_five_percent(value, near):
     assert got.found == 1 and (got.valued == 1) is near and got.strict is near
 
 
+@pytest.mark.parametrize("value, near", [(0.0, True), (0.019, True), (0.021, False)])
+def test_a_truth_of_zero_is_told_within_five_percent_of_what_there_was_too_much(value, near):
+    said = finding(frictionloss=(value, 0.0, 0.1))
+    said["parameters"][0]["nominal"] = 0.4
+    assert score([hidden(frictionloss=0.0)], [said]).strict is near
+
+
 def test_a_value_of_null_is_not_right():
     assert score([hidden()], [finding(frictionloss=(None, None, None))]).valued == 0
 
