@@ -98,9 +98,9 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
 def _checked(search, found, fitted, others, log):
     """The Outcome so far: curves tried beside the names, and what is left."""
     world, train, judge = search.world, search.train, found.judge
-    dependences = unmodelled_force.dependences(world, found.first, train)
+    dependences = unmodelled_force.dependences(world, found.first, train, most=None)
     trajectory = found.trajectory
-    left = unmodelled_force.dependences(world, trajectory, train)
+    left = unmodelled_force.dependences(world, trajectory, train, most=None)
     for rest in left[:2]:
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         # where no name is found, all that is told are a joint and a variable

@@ -19,6 +19,7 @@ from diagnosis.unnamed import depends_on, led
 SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing
 COLOURED = 3.0  # of its error under white noise, what noise of another kind may reach
 POINTS = 400  # of a located force that are told
+TOLD = 4  # dependences of it, those that stand out most
 
 
 @dataclass(frozen=True)
@@ -261,7 +262,8 @@ def missing_force(world, outcome):
                 for t in (first, last)
             ]
             linear = kind.name == "mjJNT_SLIDE" or (kind.name == "mjJNT_FREE" and i < 3)
-            depends = next((f.variables for f in outcome.dependences if f.joint == name), ())
+            told = outcome.dependences[:TOLD]
+            depends = next((f.variables for f in told if f.joint == name), ())
             out[name if v.stop - v.start == 1 else f"{name}:{i}"] = {
                 "rms": rms[0],
                 "unit": "N" if linear else "N·m",

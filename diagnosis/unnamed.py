@@ -3,8 +3,9 @@ depends on.
 
 findings = led(world, outcome, findings, something)
 
-A name stands first only where the error of its joint goes with it. Where much of that is left,
-`unknown` leads, and the name is one of those that it may be.
+A name stands first only where the error of its joint goes with it, or what is left there follows
+nothing: every machine has disturbances. Where much is left, `unknown` leads, and the name is one of
+those that it may be.
 """
 
 import numpy as np
@@ -15,7 +16,8 @@ from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND, PRICE
 from diagnosis.selection.plausibility import at_limit, plausible
 
-NEAREST = 0.25  # of a joint's error, that names leave: they are the nearest only
+# of a joint's error, and of its force that follows anything, that names leave: they are the nearest
+NEAREST = 0.25
 UNNAMED = 2  # units of complexity of a force where nothing has a name
 MOST = 3  # names that an unknown force may have, and variables that it depends on
 
@@ -31,6 +33,14 @@ def left(fitted):
         excess.append(beyond.sum((0, 2)))
     told = (evidence.reference > BEYOND**2 * noise).reshape(len(noise), evidence.channels, -1)
     return np.sqrt(excess[1] / np.where(told.any((0, 2)), excess[0], np.nan))
+
+
+def follows(outcome, joint):
+    """Share of the force that followed anything at a joint which still does so beside the names;
+    infinite where nothing did before."""
+    size = lambda found: next((d.size for d in found if d.joint == joint), 0.0)
+    before = size(outcome.dependences)
+    return size(outcome.left) / before if before else np.inf
 
 
 def _standing_out(world, outcome, joints):
@@ -163,7 +173,7 @@ def led(world, outcome, findings, something):
             told = share if np.isfinite(share) else None
             finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
             edge = _at_edge(outcome, candidate)
-            if at and (share > NEAREST or edge):
+            if at and (edge or share > NEAREST and follows(outcome, at) > NEAREST):
                 joint = at
                 names.setdefault(joint, []).append(finding)
             elif edge:

@@ -38,7 +38,7 @@ def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)
     """errors: of the elbow, before and after, in ten noises; the shoulder errs by none. room: nats
     that a perfect model would remove in the shoulder and in the elbow. gone: what was not handed
     over."""
-    dependences = [SimpleNamespace(joint=j, variables=v) for j, v in depends]
+    dependences = [SimpleNamespace(joint=j, variables=v, size=1.0) for j, v in depends]
     before, after = (np.array([[1.0, 1.0, 100 * e**2, 100 * e**2]]) for e in errors)
     evidence = SimpleNamespace(
         count=np.ones((1, 4)),
@@ -53,8 +53,9 @@ def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)
     columns = SimpleNamespace(ahead=ahead)
     fitted = SimpleNamespace(evidence=evidence, columns=columns, setting=setting)
     found = SimpleNamespace(first=trajectory, usual=USUAL, fitted=fitted)
+    handed = SimpleNamespace(gone=list(gone))
     return SimpleNamespace(
-        found=found, fitted=fitted, left=dependences, handed=SimpleNamespace(gone=list(gone))
+        found=found, fitted=fitted, left=dependences, dependences=[], handed=handed
     )
 
 
@@ -93,6 +94,16 @@ def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequat
         assert only["depends_on"] == ["position:elbow", "velocity:elbow"]
         assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
         assert only["evidence"]["held_out_error_removed"] == 0.4
+
+
+@pytest.mark.parametrize("size, effect", [(3.0, "coulomb_friction"), (5.0, "unknown")])
+def test_a_name_stands_where_what_it_leaves_follows_little(size, effect):
+    """Of a force of 16 that followed something, curves predict 3 or 5 beside the name."""
+    given = outcome(smoothed(1.0), (1.0, 0.7), DEPENDS)
+    elsewhere, there = (SimpleNamespace(joint=j, size=16.0) for j in ("shoulder", "elbow"))
+    given.dependences, given.left[0].size = [elsewhere, there], size
+    [only] = unnamed.led(WORLD, given, [finding(FRICTION)], True)
+    assert only["effect"] == effect
 
 
 def test_an_unknown_force_varies_with_what_its_nearest_name_does():
