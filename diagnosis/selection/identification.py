@@ -200,13 +200,10 @@ class Identification:
         return more if more.loss < fitted.loss else fitted
 
     def _ended(self, judge, best, now):
-        """What a round ends with: the best set without what it does not need, or what there was
-        without what is needed no more. That was chosen along the motion of another set."""
+        """What a round ends with: the best set without what it does not need, or what there was."""
         if best is not now:
             best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
-        elif len(now.setting) > 1:
-            best = self.pruned(judge, now, judge.fit({}))
         return best
 
     def earned(self, before, after):

@@ -118,19 +118,6 @@ def test_what_is_earned_only_together_stays(search, monkeypatch):
     assert search.pruned(judge, both, fitted(search, [], 9.0)) is alone
 
 
-def test_a_round_without_anything_new_drops_what_is_needed_no_more(search, monkeypatch):
-    now = fitted(search, ["coulomb_friction", "viscous_damping"], -1.0)
-    alone = fitted(search, ["coulomb_friction"], -0.99)
-    nominal = fitted(search, [], 0.0)
-    judge = SimpleNamespace(fit=lambda setting, *how: alone if setting else nominal)
-    monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[1:])
-    assert not search.earned(alone, now) and search.earned(nominal, alone)
-    assert search._ended(judge, now, now) is alone
-    assert search._ended(judge, alone, alone) is alone  # one effect was earned over nothing
-    monkeypatch.setattr(search, "earned", lambda before, after: True)
-    assert search._ended(judge, now, now) is now
-
-
 @pytest.mark.parametrize(
     "loss, settled, kept", [(-1.1, True, True), (-0.4, True, False), (-1.1, False, False)]
 )
