@@ -85,6 +85,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
         fitted = search.pruned(found.judge, fitted, found.judge.fit({}))
     fitted = changing(found.judge, fitted)
+    others = rivals.together(others, fitted, found.sets)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
     outcome.event = event or _sometimes(search, found, outcome.fitted, log)

@@ -21,6 +21,7 @@ from diagnosis.selection.first_look import likely
 from diagnosis.selection.judge import Fitted, Judge, problem
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
+from diagnosis.selection.rivals import TIED, as_good, carried
 from diagnosis.selection.starts import Starts
 from diagnosis.selection.unmodelled_force import dependences
 
@@ -37,7 +38,7 @@ class Found:
     """What the search ended with: fitted, the Fitted set; trajectory and first, smoothed under it
     and under the nominal model; judge, on the windows begun at that trajectory; missing, the
     MissingForce of the last round; ranking: [(candidate, loss removed alone, p-value)], most
-    first."""
+    first; sets: Fitted sets of other effects that predict as well."""
 
     fitted: Fitted
     trajectory: object
@@ -47,6 +48,7 @@ class Found:
     judge: Judge
     missing: MissingForce
     ranking: list
+    sets: list
 
 
 class Identification:
@@ -55,7 +57,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen, self.missing = {}, None
+        self.seen, self.missing, self.sets = {}, None, []
         self.looked = 1.0  # how many different columns a round looks at
         self.candidates = [
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
@@ -89,7 +91,9 @@ class Identification:
             self.screen.start(trajectory, setting)
             judge = self.judge()
             fitted = judge.fit(setting)
-        return Found(fitted, trajectory, first, smoother, self.usual, judge, self.missing, ranking)
+            self.sets = carried(judge, self.sets, fitted, fitted)
+        told = self.missing, ranking, self.sets
+        return Found(fitted, trajectory, first, smoother, self.usual, judge, *told)
 
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
@@ -131,8 +135,18 @@ class Identification:
             if not fitted.settled:  # what has no value may hide others that have
                 judged.append(judge.fit(fitted.inside, steps=3, near=fitted))
         best = self._ended(judge, self._choose(judged, now), now)
+        best = self._beside(judge, judged, now, best)
         better = best.setting.keys() != setting.keys()
         return best, better, [] if setting else self._ranking(beam, start, nodes)
+
+    def _beside(self, judge, judged, now, best):
+        """The best set, or the one of an earlier round that is better with what is new; sets that
+        are as good are carried on."""
+        earlier = carried(judge, self.sets, now, best)
+        better = [f for f in earlier if f.settled and f.loss < best.loss - TIED]
+        best = min([best, *better], key=lambda f: f.loss)
+        self.sets = as_good(judged + earlier, best)
+        return best
 
     def _curves(self, setting):
         """[(candidate, values)] of forces without a name, in joints that no effect of a setting has

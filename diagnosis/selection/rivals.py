@@ -3,10 +3,18 @@ best for its price first.
 
 fitted, others = classes(candidates, judge, missing, fitted, begun)
 others[candidate]                                    # [(other, values), ...]
+
+What predicts as well may be a set of other effects too: a gain and a damping are a mass and an
+armature seen from the other side. They are carried from round to round.
+
+judged += carried(judge, sets, now, best)
+sets = as_good(judged, best)                         # of the Fitted sets that a round has judged
+others = together(others, fitted, sets)
 """
 
 import numpy as np
 
+from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.first_look import likely
@@ -20,6 +28,7 @@ CHANCE = 0.05  # p-value of that, above which it may be worse by any
 # how much more complex another member of a class may be: three components for one number
 FURTHER = 2.5
 REFITS, MOST = 4, 3  # others that are refitted, and told
+SETS = 3  # of other effects, that are carried from round to round
 
 
 def classes(candidates, judge, missing, fitted, begun, log=lambda what: None):
@@ -46,6 +55,47 @@ def classes(candidates, judge, missing, fitted, begun, log=lambda what: None):
         others[own] += _late(pool, begun, missing.chain.world, fitted, own)
     others = {c: each[:MOST] for c, each in others.items() if c in fitted.setting}
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
+
+
+def as_good(judged, best):
+    """The Fitted sets, of several that were judged, that predict as well as the best one with other
+    effects; the best SETS of them."""
+    some = [f for f in judged if f.settled and _tied(f.score, best.score) and _instead(f, best)]
+    return sorted(some, key=lambda f: f.loss)[:SETS]
+
+
+def carried(judge, sets, now, best):
+    """Fitted sets of an earlier round, judged in this one: as they are, and with what the best set
+    has more than there was."""
+    new = {c: v for c, v in best.setting.items() if c not in now.setting}
+    tries = [f.setting for f in sets] + [{**new, **f.setting} for f in sets if new]
+    return [judge.fit(setting, steps=3, near=best) for setting in tries]
+
+
+def together(others, fitted, sets):
+    """The others {candidate: [(other, values)]} of a Fitted set's findings, with those of sets that
+    predict as well."""
+    out = dict(others)
+    for rival in as_good(sets, fitted):
+        new, gone = _instead(rival, fitted)
+        for candidate in gone:
+            told = {o for o, _ in out.get(candidate, [])}
+            more = [(o, rival.setting[o]) for o in new if o not in told]
+            out[candidate] = [*out.get(candidate, []), *more][:MOST]
+    return out
+
+
+def _instead(rival, fitted):
+    """(effects of one Fitted set, those of another one that they stand for), or None: where one is
+    part of the other, a round has compared them. A curve is no name that others could have, and
+    much more complex ones are no equals."""
+    new, gone = (
+        [c for c in a.setting if c not in b.setting and not c.effect.numerical]
+        for a, b in ((rival, fitted), (fitted, rival))
+    )
+    named = not any(isinstance(c.effect, Unknown) for c in new)
+    alike = named and complexity(new) <= complexity(gone) + FURTHER
+    return (new, gone) if alike and new and gone else None
 
 
 def _members(candidates, judge, before, fitted, candidate):

@@ -71,6 +71,19 @@ def test_a_set_is_chosen_for_its_worth(search):
     assert search._choose([now, chance, friction], now) is now  # the best is not earned
 
 
+@pytest.mark.parametrize(
+    "loss, settled, takes", [(-1.2, True, 1), (-1.05, True, 0), (-2, False, 0)]
+)
+def test_a_set_of_an_earlier_round_takes_over_where_it_is_better(
+    search, monkeypatch, loss, settled, takes
+):
+    best = fitted(search, ["coulomb_friction"], -1.0)
+    other = fitted(search, ["viscous_damping"], loss, settled)
+    monkeypatch.setattr(identification, "carried", lambda *given: [other])
+    assert search._beside(None, [best], best, best) is (other if takes else best)
+    assert search.sets == ([other] if loss == -1.05 else [])  # as good, and carried on
+
+
 @pytest.mark.parametrize("share, kept", [(1.3, True), (0.8, False)])
 def test_an_effect_of_a_set_is_one_of_many_that_were_looked_at(search, share, kept, monkeypatch):
     """In 16 groups gains of 1.3 and 0.8 times their scatter have p-values of 1e-4 and 4e-3: the

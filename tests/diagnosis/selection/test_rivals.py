@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection import rivals
 from diagnosis.selection.criterion import PRICE, Score
 
@@ -86,3 +87,58 @@ def test_the_same_effect_in_a_like_place_is_tried_at_the_findings_own_value(monk
     fitted = SimpleNamespace(setting={foot: (220.0,)})
     rivals._members([], judge, before, fitted, foot)
     assert begun == [{ground: (220.0,)}, {other: (5.0,)}]
+
+
+GAIN, DAMPING, MASS, ARMATURE = (
+    Named(name, units)
+    for name, units in (("gain", 1), ("damping", 1), ("mass", 1), ("armature", 2))
+)
+CURVE = Named("curve", 2)
+CURVE.effect = Unknown("velocity:elbow", np.array([-1.0, 1.0]))
+
+
+def set_of(loss, *candidates):
+    """A Fitted set that predicts as well as others of its loss, and no other."""
+    score = Score(loss, loss + np.linspace(-1e-6, 1e-6, 4), np.full(4, 4 * loss), ())
+    setting = {c: (loss,) for c in candidates}
+    return SimpleNamespace(setting=setting, score=score, loss=loss, settled=True)
+
+
+BEST = set_of(-2.0, GAIN, DAMPING)
+
+
+@pytest.mark.parametrize(
+    "judged, good",
+    [
+        (set_of(-1.95, MASS, ARMATURE), True),
+        (set_of(-2.5, MASS, ARMATURE), True),  # better, but for a price that it is not worth
+        (set_of(-1.8, MASS, ARMATURE), False),  # worse
+        (set_of(-2.0, MASS, DAMPING), True),  # one effect in the place of another
+        (set_of(-2.0, GAIN, DAMPING, MASS), False),  # more of the same
+        (set_of(-2.0, GAIN), False),
+        (set_of(-2.0, CURVE, MASS), False),  # no name
+        (set_of(-2.0, MASS, ARMATURE, CURVED), False),  # much more complex
+    ],
+)
+def test_a_set_of_other_effects_that_predicts_as_well_is_carried_on(judged, good):
+    assert rivals.as_good([BEST, judged], BEST) == ([judged] if good else [])
+
+
+def test_sets_of_an_earlier_round_are_judged_as_they_are_and_with_what_is_new():
+    asked, now = [], set_of(-1.0, GAIN)
+    judge = SimpleNamespace(fit=lambda setting, steps, near: asked.append((set(setting), near)))
+    rivals.carried(judge, [set_of(-1.0, MASS, ARMATURE)], now, BEST)
+    assert asked == [({MASS, ARMATURE}, BEST), ({MASS, ARMATURE, DAMPING}, BEST)]
+    asked.clear()
+    rivals.carried(judge, [set_of(-1.0, MASS)], BEST, BEST)
+    assert asked == [({MASS}, BEST)]
+
+
+def test_a_set_that_stands_for_several_findings_is_told_beside_each():
+    single = {GAIN: [(MASS, (3.0,))], DAMPING: []}
+    told = rivals.together(single, BEST, [set_of(-1.95, MASS, ARMATURE)])
+    assert told == {
+        GAIN: [(MASS, (3.0,)), (ARMATURE, (-1.95,))],
+        DAMPING: [(MASS, (-1.95,)), (ARMATURE, (-1.95,))],
+    }
+    assert rivals.together(single, BEST, [set_of(-1.5, MASS, ARMATURE)]) == single
