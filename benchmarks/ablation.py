@@ -34,6 +34,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no values at full size": {"diagnosis.selection.starts:LADDER": ()},
     "no second look at the values that suit": {"diagnosis.selection.columns:SECANTS": 0},
     "no classes": {"diagnosis.selection.rivals:REFITS": 0},
+    "no sets carried on": {"diagnosis.selection.rivals:SETS": 0},
     "no rival that leaves more": {"diagnosis.selection.rivals:APART": 0.0},
     "no slow waves": {"diagnosis.selection.unmodelled_force:WAVES": (4.0, 30.0, 0.1)},
     "tiny steps": {"diagnosis.selection.starts:STEP": 0.0},

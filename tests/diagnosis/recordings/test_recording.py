@@ -410,6 +410,21 @@ def test_signs_and_columns_that_the_model_cannot_follow(model, spoil, says):
         check([recording(table)], model)
 
 
+@pytest.mark.parametrize("wrong, beyond_doubt", [((1, 0, 0), False), ((1, 1, 0), True)])
+def test_a_sign_is_beyond_doubt_where_most_recordings_have_it(model, wrong, beyond_doubt):
+    sign = np.array([1, 1, -1, 1, 1, 1, 1])
+    tables = [run(amplitude=2.0 + 0.1 * k) * sign**turned for k, turned in enumerate(wrong)]
+    for table in tables:
+        table[:, 3:5] = np.nan
+    recordings = [recording(t, f"{k}.csv") for k, t in enumerate(tables)]
+    says = "column 'qpos:elbow' seems to have the wrong sign"
+    if beyond_doubt:
+        with pytest.raises(RecordingError, match=f"0.csv: {says}"):
+            check(recordings, model)
+    else:
+        assert any(line.startswith(f"0.csv: {says}") for line in check(recordings, model))
+
+
 @pytest.mark.parametrize(
     "factor, gear, says",
     [
