@@ -253,7 +253,7 @@ def missing_force(world, outcome):
     """{joint: rms before and after, unit, what it depends on}: the force that the nominal model
     lacks."""
     out, model = {}, world.model
-    first, last = outcome.found.first, outcome.trajectory
+    first, last, told = outcome.found.first, outcome.trajectory, outcome.dependences[:TOLD]
     for j, kind, _, v in windowing.joint_slices(model):
         name = windowing.joint_name(model, j)
         for i, d in enumerate(range(v.start, v.stop)):
@@ -262,7 +262,6 @@ def missing_force(world, outcome):
                 for t in (first, last)
             ]
             linear = kind.name == "mjJNT_SLIDE" or (kind.name == "mjJNT_FREE" and i < 3)
-            told = outcome.dependences[:TOLD]
             depends = next((f.variables for f in told if f.joint == name), ())
             out[name if v.stop - v.start == 1 else f"{name}:{i}"] = {
                 "rms": rms[0],

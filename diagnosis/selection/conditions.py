@@ -13,7 +13,7 @@ from diagnosis.common.distributions import f_sf
 from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND
 from diagnosis.selection.identification import LEVEL
-from diagnosis.selection.transients import CONCENTRATED, LONGEST, STEADY
+from diagnosis.selection.transients import CONCENTRATED, LONGEST, SHORTEST, STEADY
 from diagnosis.selection.unmodelled_force import dependences
 
 
@@ -43,7 +43,7 @@ class Condition:
         """The recordings while it holds."""
         within = lambda r: np.searchsorted(r.time, self.time)
         some = [(r, *within(r)) for r in recordings if self.recording in (None, r)]
-        return [r.part(a, b + 1) for r, a, b in some if b - a > 8]
+        return [r.part(a, b + 1) for r, a, b in some if b - a > SHORTEST]
 
     def placed(self, world, candidate):
         """An effect that acts only while it holds: a mass that comes is a load."""

@@ -238,9 +238,9 @@ class Identification:
         is earned over what there was: together effects may be earned of which none is. Those that
         small changes show to be needed are not tried without."""
         while len(fitted.setting) > 1:
+            rest = lambda out: {c: v for c, v in fitted.setting.items() if c is not out}
             tries = [
-                judge.fit({c: v for c, v in fitted.setting.items() if c is not out}, 3, fitted)
-                for out in self._missed_least(fitted)
+                judge.fit(rest(out), steps=3, near=fitted) for out in self._missed_least(fitted)
             ]
             tries = [f for f in tries if self.earned(now, f)]
             less = min(tries, key=lambda f: f.loss, default=None)

@@ -7,8 +7,8 @@ others[candidate]                                    # [(other, values), ...]
 What predicts as well may be a set of other effects too: a gain and a damping are a mass and an
 armature seen from the other side. They are carried from round to round.
 
-judged += carried(judge, sets, now, best)
-sets = as_good(judged, best)                         # of the Fitted sets that a round has judged
+earlier = carried(judge, sets, now, best)            # sets of the round before, judged in this one
+sets = as_good(judged + earlier, best)
 others = together(others, fitted, sets)
 """
 

@@ -25,6 +25,7 @@ MOST = 400  # windows that are looked at, those about the largest located force
 CONCENTRATED = 0.8  # of what lies above the usual residual, the share that the event must explain
 ALONE = 0.9  # of an event's gain, the share of one window, above which that window is odd
 LONGEST = 0.6  # of all recordings: what lasts longer is no event
+SHORTEST = 8  # rows, of which a stretch needs more
 TRIES = 50  # intervals that are looked at closer
 STEADY = {"external_force": "external_force", "payload_change": "mass"}  # what comes, what lasts
 UNSEEN = 1e-8  # squared size, in noises, of a step that shows nowhere
@@ -169,7 +170,7 @@ def quiet(recording, event):
         return [(recording.start, rows)]
     start, stop = np.searchsorted(recording.time, event.time)
     stretches = (recording.start, int(start)), (int(stop) + 1, rows)
-    return [(a, b) for a, b in stretches if b - a > 8]
+    return [(a, b) for a, b in stretches if b - a > SHORTEST]
 
 
 def calm(recordings, event):

@@ -95,7 +95,7 @@ def test_an_effect_of_a_set_is_one_of_many_that_were_looked_at(search, share, ke
     less.score = Score(groups.mean(), groups, np.zeros(16), ())
     less.loss = less.score.loss + PRICE * identification.complexity(less.setting)
     monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[:1])
-    judge = SimpleNamespace(fit=lambda setting, *how: less)
+    judge = SimpleNamespace(fit=lambda setting, **how: less)
     now = fitted(search, [], 2.0)
     assert search.pruned(judge, both, now) is (both if kept else less)
 
@@ -124,7 +124,7 @@ def test_what_is_earned_only_together_stays(search, monkeypatch):
     noisy = alone.score.groups + odd
     alone.score = Score(alone.score.loss, noisy, np.zeros(16), ())
     monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[:1])
-    judge = SimpleNamespace(fit=lambda setting, *how: alone)
+    judge = SimpleNamespace(fit=lambda setting, **how: alone)
     assert search.earned(now, both)
     assert not search.earned(alone, both) and not search.earned(now, alone)
     assert search.pruned(judge, both, now) is both
