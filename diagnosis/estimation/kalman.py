@@ -34,68 +34,68 @@ def smooth(A, c, Q, y, R, start, spread, counts=None):
     and variances before the first row. The last row's A, c and Q are not used. counts (T, b): the
     rows that tell R's scores, by default all.
     """
-    T, b, n = c.shape
     m = y.shape[-1]
     known = np.isfinite(y)
     filtered = _forward(A, c, Q, np.where(known, y, 0.0), known, R, start, spread)
-    predicted, covariance, gain, inverse, error, likelihood = filtered
-    r, N = np.zeros((b, n)), np.zeros((b, n, n))
-    state, variance = np.empty((T, b, n)), np.empty((T, b, n))
-    process, measurement = np.zeros((2, n)), np.zeros((2, m))
+    predicted, P, K, Finv, error, likelihood = filtered
+    keep = np.broadcast_to(np.eye(c.shape[-1]), P.shape).copy()
+    keep[..., :m] -= K
+    pushed = _times(Finv, error)
+    r, behind, N, within, D = _backward(A, keep, pushed, P, K, Finv)
+    state = predicted + _times(P, r)
+    variance = np.einsum("tbii->tbi", P) - within
+    process = (Q[:-1] * r[1:] ** 2).sum((0, 1)), (Q[:-1] * N[1:]).sum((0, 1))
+    u = pushed - _times(np.swapaxes(K, -1, -2), behind)
+    told = known if counts is None else known & counts[..., None]
+    measurement = (u**2 * told).sum((0, 1)), (D * told).sum((0, 1))
+    return Smoothed(state, np.maximum(variance, 0.0), process, measurement, likelihood)
+
+
+def _backward(A, keep, pushed, P, K, Finv):
+    """Of every row, with its own measurement and without: r (T, b, n), A' r of the row behind; and
+    the diagonals (T, b, n) of N and P N P, and (T, b, m) of F^-1 + K' A' N A K."""
+    T, b, n = keep.shape[:-1]
+    m = pushed.shape[-1]
+    r, behind, diagonal, within = (np.zeros((T, b, n)) for _ in range(4))
+    D = np.einsum("tbii->tbi", Finv).copy()
+    r[..., :m], N = pushed, np.zeros((b, n, n))
     for t in range(T - 1, -1, -1):
         if t < T - 1:
-            process[0] += (Q[t] * r**2).sum(0)
-            process[1] += (Q[t] * np.einsum("bii->bi", N)).sum(0)
-            At = A[t].transpose(0, 2, 1)
-            r = (At @ r[..., None])[..., 0]
+            At, kept, Kt = (x[t].transpose(0, 2, 1) for x in (A, keep, K))
+            behind[t] = _times(At, r[t + 1])
             N = At @ N @ A[t]
-        K, Finv, k = gain[t], inverse[t], known[t]
-        Kt = K.transpose(0, 2, 1)
-        u = ((Finv @ error[t][..., None]) - Kt @ r[..., None])[..., 0]
-        D = np.einsum("bii->bi", Finv) + (Kt @ N * Kt).sum(-1)
-        told = k if counts is None else k & counts[t][:, None]
-        measurement[0] += (u**2 * told).sum(0)
-        measurement[1] += (D * told).sum(0)
-        # r before the measurement: H' F^-1 v + (I - K H)' r
-        keep = np.tile(np.eye(n), (b, 1, 1))
-        keep[:, :, :m] -= K
-        r = (keep.transpose(0, 2, 1) @ r[..., None])[..., 0]
-        r[:, :m] += (Finv @ error[t][..., None])[..., 0]
-        N = keep.transpose(0, 2, 1) @ N @ keep
-        N[:, :m, :m] += Finv
-        P = covariance[t]
-        state[t] = predicted[t] + (P @ r[..., None])[..., 0]
-        variance[t] = np.einsum("bii->bi", P) - (P @ N * P).sum(-1)
-    return Smoothed(
-        state, np.maximum(variance, 0.0), tuple(process), tuple(measurement), float(likelihood)
-    )
+            r[t] += _times(kept, behind[t])
+            D[t] += (Kt @ N * Kt).sum(-1)
+            N = kept @ N @ keep[t]
+        N[:, :m, :m] += Finv[t]
+        diagonal[t] = np.einsum("bii->bi", N)
+        within[t] = (P[t] @ N * P[t]).sum(-1)
+    return r, behind, diagonal, within, D
+
+
+def _times(matrices, vectors):
+    return (matrices @ vectors[..., None])[..., 0]
 
 
 def _forward(A, c, Q, y, known, R, start, spread):
     """Predicted states and covariances, gains (T, b, n, m), F^-1 (T, b, m, m) with 0 for what is
-    not measured, errors."""
+    not measured, errors, and the log-likelihood."""
     T, b, n = c.shape
     m = y.shape[-1]
-    x, P = start.copy(), np.einsum("bi,ij->bij", spread, np.eye(n))
-    xs, Ps = np.empty((T, b, n)), np.empty((T, b, n, n))
-    gains, inverses, errors = np.zeros((T, b, n, m)), np.empty((T, b, m, m)), np.empty((T, b, m))
-    likelihood, eye = 0.0, np.eye(m)
+    x, P = start, np.einsum("bi,ij->bij", spread, np.eye(n))
+    xs, Ps, gains = np.empty((T, b, n)), np.empty((T, b, n, n)), np.empty((T, b, n, m))
+    errors, Fs, inverses = np.empty((T, b, m)), np.empty((T, b, m, m)), np.empty((T, b, m, m))
+    pair, noise = known[..., None] & known[..., None, :], np.diag(R)
     for t in range(T):
-        xs[t], Ps[t], k = x, P, known[t]
-        pair = k[:, :, None] & k[:, None]
-        F = np.where(pair, P[:, :m, :m] + R * eye, eye)
-        inverse = np.linalg.inv(F)
-        error = np.where(k, y[t] - x[:, :m], 0.0)
-        squares = error * (inverse @ error[..., None])[..., 0]
-        likelihood -= 0.5 * (np.linalg.slogdet(F)[1].sum() + squares.sum())
-        inverse = inverse * pair
-        K = P[:, :, :m] @ inverse
-        gains[t], inverses[t], errors[t] = K, inverse, error
-        x = x + (K @ error[..., None])[..., 0]
-        P = P - K @ P[:, :m]
-        if t < T - 1:
-            x = (A[t] @ x[..., None])[..., 0] + c[t]
-            P = A[t] @ P @ A[t].transpose(0, 2, 1)
-            P[:, range(n), range(n)] += Q[t]
-            P = (P + P.transpose(0, 2, 1)) / 2
-    return xs, Ps, gains, inverses, errors, likelihood
+        xs[t], Ps[t] = x, P
+        Fs[t] = np.where(pair[t], P[:, :m, :m] + noise, np.eye(m))
+        inverses[t] = np.linalg.inv(Fs[t])
+        errors[t] = (y[t] - x[:, :m]) * known[t]
+        gains[t] = P[:, :, :m] @ (inverses[t] * pair[t])
+        x = _times(A[t], x + _times(gains[t], errors[t])) + c[t]
+        P = A[t] @ (P - gains[t] @ P[:, :m]) @ A[t].transpose(0, 2, 1)
+        P[:, range(n), range(n)] += Q[t]
+        P = (P + np.swapaxes(P, -1, -2)) / 2
+    squares = errors * _times(inverses, errors)
+    likelihood = -0.5 * (np.linalg.slogdet(Fs)[1].sum() + squares.sum())
+    return xs, Ps, gains, inverses * pair, errors, float(likelihood)

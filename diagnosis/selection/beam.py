@@ -52,22 +52,32 @@ class Beam:
         self.free = [k for k, o in enumerate(columns.options) if o.candidate not in inside]
 
     def node(self, options, by=None):
-        """The Node of some options (those kept included); by: the Evidence that they are fitted to,
-        if not that of the motion."""
-        key = by is None, tuple(sorted(options))
-        if key not in self.known:
-            self.known[key] = self._worked_out(tuple(options), by or self.evidence)
-        return self.known[key]
+        """The Node of some options, as nodes_of() takes them."""
+        return self.nodes_of([options], by)[0]
 
-    def _worked_out(self, options, evidence):
-        given = problem(self.columns, options)
-        score = evidence.score(*given)
+    def nodes_of(self, sets, by=None):
+        """The Nodes of some sets of options (those kept included); by: the Evidence that they are
+        fitted to, if not that of the motion."""
+        keys = [(by is None, tuple(sorted(options))) for options in sets]
+        new = {k: tuple(options) for k, options in zip(keys, sets) if k not in self.known}
+        self.known.update(zip(new, self._worked_out(list(new.values()), by or self.evidence)))
+        return [self.known[k] for k in keys]
+
+    def _worked_out(self, sets, evidence):
+        given = [problem(self.columns, options) for options in sets]
+        scores = zip(sets, given, evidence.scores(given))
+        return [
+            self._node(options, index, score, evidence) for options, (index, *_), score in scores
+        ]
+
+    def _node(self, options, index, score, evidence):
+        """The Node of options, of columns index, with a Score by an Evidence."""
         setting = moved_setting(self.columns, score.amounts, options)
         chosen = [self.columns.options[k] for k in options]
         nats = sum(cost(o.candidate, setting[o.candidate], o.prior) for o in chosen)
         price = PRICE * complexity(o.candidate for o in chosen)
         asked = self.missing and evidence is self.evidence
-        lacks = self.missing.at(given[0], score.amounts) if asked else None
+        lacks = self.missing.at(index, score.amounts) if asked else None
         return Node(options, score, nats / evidence.number, price, lacks)
 
     def _against(self, node, new):
@@ -105,8 +115,8 @@ class Beam:
         # most, and what comes first decides what is tried beside it
         first = node.options == self.kept
         grown = []
-        for k in self.free if first else self._looks(node):
-            new = self.node((*node.options, k))
+        further = self.free if first else self._looks(node)
+        for k, new in zip(further, self.nodes_of([(*node.options, k) for k in further])):
             if self._against(node, new):
                 continue
             met[self._key(new)] = new
@@ -126,7 +136,7 @@ class Beam:
             best, held = grown[0], self._candidates(grown[0])
             others = [k for k in self.free if self.columns.options[k].candidate not in held]
             named = [k for k in others if not self._unnamed(k)]
-            grown = [self.node((*best.options, k), self.missing) for k in named]
+            grown = self.nodes_of([(*best.options, k) for k in named], self.missing)
             grown.sort(key=lambda n: n.loss)
         return self.node(best.options)
 
@@ -149,9 +159,8 @@ class Beam:
         """Meet the sets that are left when effects go again, the one that is missed least first,
         as long as that is better."""
         while len(node.options) > len(self.kept) + 1:
-            fewer = []
-            for out in node.options[len(self.kept) :]:
-                less = self.node(tuple(k for k in node.options if k != out))
+            added, fewer = node.options[len(self.kept) :], []
+            for less in self.nodes_of([[k for k in node.options if k != out] for out in added]):
                 if not self._against(start, less):
                     met[self._key(less)] = less
                     fewer.append(less)

@@ -164,18 +164,13 @@ class Columns:
         A small step of what sticks, saturates or is late by less than a row says little of a large
         one.
         """
-        ranked = []
-        for k, option in enumerate(self.options):
-            if len(option.columns) > 1 or option.merges or option.candidate in self.setting:
-                continue
-            precision, pull = option.quadratic()
-            score = evidence.score(option.columns, option.low, option.high, precision, pull)
-            if abs(score.amounts[0]) > 1e-9:
-                ranked.append((score.loss, k, score.amounts))
+        single = lambda o: len(o.columns) == 1 and not o.merges and o.candidate not in self.setting
+        some = [o for o in self.options if single(o)]
+        found = evidence.scores([(o.columns, o.low, o.high, *o.quadratic()) for o in some])
+        moved = [(score, o) for score, o in zip(found, some) if abs(score.amounts[0]) > 1e-9]
         starts = []
-        for _, k, amounts in sorted(ranked, key=lambda x: x[:2])[:SECANTS]:
-            o = self.options[k]
-            row = np.array(o.values(amounts)) - o.base
+        for score, o in sorted(moved, key=lambda pair: pair[0].loss)[:SECANTS]:
+            row = np.array(o.values(score.amounts)) - o.base
             if not row.any():
                 continue
             with np.errstate(divide="ignore", invalid="ignore"):

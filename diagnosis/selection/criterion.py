@@ -24,6 +24,7 @@ NOISE = 0.3  # of the noise, that counts as none
 BEYOND = 1.5  # of the noise, from which on an error counts
 ITERATIONS = 4  # of reweighted least squares
 INDEPENDENT = 2.0  # errors as which the rows of a cell count, at most
+TOGETHER = 16  # hypotheses that are worked out at once
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
 
 
@@ -160,47 +161,62 @@ class Evidence:
             self.crossed[w, j] = block @ self.columns[:, a : a + n].T
 
     def _sums(self, product):
-        """(W, cells) of a product of columns (N,)."""
-        out = np.zeros(self.shape[0] * self.shape[1])
-        if len(product):
-            out[self.cell[self.first]] = np.add.reduceat(product, self.first)
-        return out.reshape(self.shape)
+        """(..., W, cells) of products of columns (..., N)."""
+        out = np.zeros((*product.shape[:-1], self.shape[0] * self.shape[1]))
+        if product.shape[-1]:
+            out[..., self.cell[self.first]] = np.add.reduceat(product, self.first, axis=-1)
+        return out.reshape(*product.shape[:-1], *self.shape)
 
     def _products(self, index):
-        """(W, cells, p, p): sums of products of columns index (p,), 0 being the residual, start
-        states as they are."""
+        """(..., W, cells, p, p): sums of products of columns index (..., p), 0 being the residual,
+        start states as they are."""
+        *some, p = index.shape
         chosen = self.columns[index]
-        out = np.empty((*self.shape, len(index), len(index)))
-        for i, a in enumerate(chosen):
+        out = np.empty((*some, *self.shape, p, p))
+        for i in range(p):
             for j in range(i + 1):
-                out[:, :, i, j] = out[:, :, j, i] = self._sums(a * chosen[j])
+                sums = self._sums(chosen[..., i, :] * chosen[..., j, :])
+                out[..., i, j] = out[..., j, i] = sums
         return out
 
+    def _crossed(self, index):
+        """(..., W, cells, m, p): products of the starts with columns index (..., p)."""
+        out = self.crossed[..., index]
+        return np.moveaxis(out, range(3), range(index.ndim - 1, index.ndim + 2))
+
     def _moved(self, crossed, square):
-        """(W, m, p): how many standard deviations start states follow columns, from their products
-        crossed (W, cells, m, p) with the starts, where errors are of mean squares (G, cells)."""
+        """(..., W, m, p): how many standard deviations start states follow columns, from their
+        products crossed (..., W, cells, m, p) with the starts, where errors are of mean squares
+        (..., G, cells)."""
         # rows err alike where a model does: those of a cell count as few errors
         weight = (
             INDEPENDENT / np.maximum(self.rows, 1) * (self.group.T @ (1 / (square + self.floor)))
         )
         m = self.starts.shape[-1]
-        inside = np.einsum("wc,wcij->wij", weight, self.starts) + np.eye(m)
-        return np.linalg.solve(inside, np.einsum("wc,wcip->wip", weight, crossed))
+        inside = np.einsum("...wc,wcij->...wij", weight, self.starts) + np.eye(m)
+        return np.linalg.solve(inside, np.einsum("...wc,...wcip->...wip", weight, crossed))
 
     def _freed(self, products, crossed, square):
-        """(G, cells, p, p): products of columns from which start states have taken their share."""
-        moved = self._moved(crossed, square)[:, None]
-        shared = np.swapaxes(crossed, 2, 3) @ moved
-        left = products - shared - np.swapaxes(shared, 2, 3)
-        left += np.swapaxes(moved, 2, 3) @ self.starts @ moved
-        return np.tensordot(self.group.astype(float), left, 1)
+        """(..., G, cells, p, p): products of columns from which start states have taken their
+        share."""
+        moved = self._moved(crossed, square)[..., None, :, :]
+        shared = np.swapaxes(crossed, -1, -2) @ moved
+        left = products - shared - np.swapaxes(shared, -1, -2)
+        left += np.swapaxes(moved, -1, -2) @ self.starts @ moved
+        return self._grouped(left)
+
+    def _grouped(self, products):
+        """(..., G, cells, p, p) of products (..., W, cells, p, p)."""
+        *some, windows, cells, p, _ = products.shape
+        flat = products.reshape(*some, windows, cells * p * p)
+        return (self.group.astype(float) @ flat).reshape(*some, len(self.group), cells, p, p)
 
     def freed(self, columns, amounts):
         """(G, cells, p + 1, p + 1): sums of products of the residual and columns (p,), start states
         free, where these have amounts (p,)."""
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
-        products, crossed = self._products(index), self.crossed[..., index]
-        g = np.tensordot(self.group.astype(float), products, 1)
+        products, crossed = self._products(index), self._crossed(index)
+        g = self._grouped(products)
         for _ in range(ITERATIONS):
             g = self._freed(products, crossed, self._square(g, amounts))
         return g
@@ -210,10 +226,11 @@ class Evidence:
         return self._square(self.freed(columns, amounts), amounts)
 
     def _square(self, g, amounts):
-        """Mean squared error (G, cells) of amounts (p,) or (G, p), from products g."""
+        """Mean squared error (..., G, cells) of amounts (p,) or (..., G or 1, p), from products
+        g."""
         z = np.concatenate([np.ones((*amounts.shape[:-1], 1)), -amounts], -1)
-        z = np.atleast_2d(z)[:, None, :, None]
-        square = (np.swapaxes(z, 2, 3) @ (g @ z))[..., 0, 0]
+        z = np.atleast_2d(z)[..., None, :, None]
+        square = (np.swapaxes(z, -1, -2) @ (g @ z))[..., 0, 0]
         return np.maximum(square, 0.0) / np.maximum(self.count, 1)
 
     def _counting(self, square):
@@ -227,7 +244,8 @@ class Evidence:
         log = 0.5 * np.log((square + self.floor) / (self.reference + self.floor))
         counting = self._counting(np.maximum(square, self.reference))
         each = counting * log
-        return each, each / np.maximum(counting.sum(0), 1.0) / self.cells
+        shares = each / np.maximum(counting.sum(-2, keepdims=True), 1.0) / self.cells
+        return each, shares
 
     def _scored(self, square, amounts):
         """The Score of mean squared errors (G, cells)."""
@@ -268,38 +286,64 @@ class Evidence:
         columns: indices (p,); low, high (p,): bounds of the amounts; precision, pull (p,): of a
         quadratic prior, precision/2 amount² - pull amount, in nats.
         """
-        index = np.concatenate([[0], np.asarray(columns, int) + 1])
-        amounts = np.zeros(len(columns))
-        if not len(columns):
-            return self.at((), amounts)
-        prior = np.diag(precision), pull, low, high
-        g, amounts = self._fitted(self._products(index), self.crossed[..., index], prior)
-        each = np.einsum("gc,gcij->gij", self.weight(g, amounts), g)
-        rest = each.sum(0) - each
-        left = each_bounded(rest[:, 1:, 1:] + np.diag(precision), rest[:, 1:, 0] + pull, low, high)
-        return self._scored(self._square(g, left), amounts)
+        return self.scores([(columns, low, high, precision, pull)])[0]
+
+    def scores(self, hypotheses):
+        """[Score] of hypotheses, each as score() takes it, of which those of as many columns are
+        worked out together."""
+        out, alike = [None] * len(hypotheses), {}
+        for i, given in enumerate(hypotheses):
+            alike.setdefault(len(given[0]), []).append(i)
+        for p, every in alike.items():
+            for first in range(0, len(every), TOGETHER):
+                some = every[first : first + TOGETHER]
+                given = [np.array(x) for x in zip(*(hypotheses[i] for i in some))]
+                found = self._scores(*given) if p else [self.at((), np.zeros(0))] * len(some)
+                for i, score in zip(some, found):
+                    out[i] = score
+        return out
+
+    def _scores(self, columns, low, high, precision, pull):
+        """[Score] of hypotheses, arguments (B, p)."""
+        index = np.concatenate([np.zeros((len(columns), 1), int), columns + 1], -1)
+        prior = precision[:, :, None] * np.eye(columns.shape[1]), pull, low, high
+        g, amounts = self._fitted(self._products(index), self._crossed(index), prior)
+        each = np.einsum("bgc,bgcij->bgij", self.weight(g, amounts[:, None]), g)
+        rest = each.sum(1, keepdims=True) - each
+        matrix, vector, low, high = (x[:, None] for x in prior)
+        matrix, vector = rest[..., 1:, 1:] + matrix, rest[..., 1:, 0] + vector
+        squares = self._square(g, bounded(matrix, vector, low, high))
+        return [self._scored(square, own) for square, own in zip(squares, amounts)]
 
     def _fitted(self, products, crossed, prior):
-        """(products of the groups, start states free, amounts (p,)) of the lowest sum of logs.
+        """(products of the groups, start states free (B, G, cells, p, p), amounts (B, p)) of the
+        lowest sums of logs.
 
         That has several minima: in groups where the nominal model happens to do well, a fit that
         begins at its errors would keep them. So it begins there, and where all groups weigh alike.
         """
         precision, pull, low, high = prior
-        nominal, best = np.tensordot(self.group.astype(float), products, 1), None
+        nominal, best = self._grouped(products), None
         square = nominal[..., 0, 0] / np.maximum(self.count, 1)
-        alike = (square * self.count).sum(0) / np.maximum(self.count.sum(0), 1)
+        alike = (square * self.count).sum(-2, keepdims=True) / np.maximum(self.count.sum(0), 1)
         for begun in (square, np.broadcast_to(alike, square.shape)):
             g = nominal
             for _ in range(ITERATIONS):
-                whole = np.einsum("gc,gcij->ij", self._weighed(begun), g)
-                amounts = bounded(whole[1:, 1:] + precision, whole[1:, 0] + pull, low, high)
-                g = self._freed(products, crossed, self._square(g, amounts))
-                begun = self._square(g, amounts)
-            cost = amounts @ (precision @ amounts / 2 - pull)
-            loss = 0.5 * np.log(begun + self.floor)[self.count > 0].sum() + cost
-            if best is None or loss < best[0]:
-                best = loss, g, amounts
+                whole = np.einsum("bgc,bgcij->bij", self._weighed(begun), g)
+                matrix, vector = whole[:, 1:, 1:] + precision, whole[:, 1:, 0] + pull
+                amounts = bounded(matrix, vector, low, high)
+                g = self._freed(products, crossed, self._square(g, amounts[:, None]))
+                begun = self._square(g, amounts[:, None])
+            cost = np.einsum("bi,bij,bj->b", amounts, precision / 2, amounts)
+            cost -= (amounts * pull).sum(-1)
+            loss = 0.5 * np.log(begun + self.floor)[:, self.count > 0].sum(-1) + cost
+            found = loss, g, amounts
+            if best is None:
+                best = found
+            lower = loss < best[0]
+            best = tuple(
+                np.where(lower.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(found, best)
+            )
         return best[1:]
 
     def weight(self, g, amounts):
@@ -339,33 +383,29 @@ class Evidence:
         return np.where(seen, score**2 / np.where(seen, curve, 1.0) / 2, 0.0)
 
 
-def bounded(matrix, vector, low, high):
-    """The minimum of x' matrix x / 2 - vector x between bounds (p,)."""
-    return each_bounded(matrix[None], vector[None], low, high)[0]
-
-
-def each_bounded(matrices, vectors, low, high):
-    """bounded() of matrices (G, p, p) and vectors (G, p) at once, by active sets of the bounds that
-    are met."""
-    scale = np.sqrt(np.maximum(np.einsum("gii->gi", matrices), 1e-300))
-    eye, goal, (low, high) = np.eye(len(low)), vectors / scale, (low * scale, high * scale)
-    even = matrices / (scale[:, :, None] * scale[:, None]) + 1e-9 * eye
+def bounded(matrices, vectors, low, high):
+    """The minima (..., p) of x' matrix x / 2 - vector x between bounds (..., p), of matrices
+    (..., p, p) and vectors (..., p), by active sets of the bounds that are met."""
+    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", matrices), 1e-300))
+    eye, goal, (low, high) = np.eye(low.shape[-1]), vectors / scale, (low * scale, high * scale)
+    even = matrices / (scale[..., None] * scale[..., None, :]) + 1e-9 * eye
     x, fixed = np.clip(np.zeros_like(goal), low, high), np.zeros(goal.shape, bool)
     for _ in range(4 * len(eye) + 1):
         free = ~fixed
-        inside = np.where(free[:, :, None] & free[:, None], even, eye)
+        inside = np.where(free[..., None] & free[..., None, :], even, eye)
         push = np.where(free, goal - (even @ (x * fixed)[..., None])[..., 0], x)
         step = np.linalg.solve(inside, push[..., None])[..., 0] - x
         room = np.where(step > 0, high, low) - x
         room = np.divide(room, step, out=np.full_like(x, np.inf), where=step != 0)
-        share = np.minimum(room.min(1, initial=np.inf), 1.0)[:, None]
+        share = np.minimum(room.min(-1, initial=np.inf), 1.0)[..., None]
         x = np.clip(x + share * step, low, high)
         met = free & (share < 1) & (room <= share)
         # where nothing is met, the bound that holds back most is left
         slope = (even @ x[..., None])[..., 0] - goal
         inward = np.where(x - low < high - x, -slope, slope) * (fixed & (low < high) & (share == 1))
-        most = inward.max(1, initial=0.0, keepdims=True)
-        left = (inward == most) & (most > 1e-9 * abs(goal).max(1, initial=0.0, keepdims=True))
+        most = inward.max(-1, initial=0.0, keepdims=True)
+        size = abs(goal).max(-1, initial=0.0, keepdims=True)
+        left = (inward == most) & (most > 1e-9 * size)
         fixed = (fixed | met) & ~left
         if not (met | left).any():
             break
