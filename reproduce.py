@@ -67,12 +67,7 @@ class Job:
     def start(self):
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         with self.folder.with_suffix(".log").open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, str(ROOT / "train.py"), *self.command()],
-                stdout=log,
-                stderr=log,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
-            )
+            self.process = process([str(ROOT / "train.py"), *self.command()], log)
 
     def stop(self):
         self.process.send_signal(signal.SIGINT)
@@ -80,6 +75,18 @@ class Job:
 
     def said(self):
         return self.folder.with_suffix(".log").read_text().strip().splitlines()[-1:]
+
+
+def process(words, log):
+    """Python with some arguments, in the background. Interrupts reach it, also where a shell that
+    put us into the background has them ignored."""
+    return subprocess.Popen(
+        [sys.executable, *words],
+        stdout=log,
+        stderr=log,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
 
 
 def run_all(jobs, width, deadline, keep):

@@ -2,8 +2,10 @@
 
 import itertools
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -131,8 +133,12 @@ def test_one_job_trains_what_others_begin_with_and_none_is_lost(tmp_path, monkey
 def test_it_stops_in_time_and_says_what_waits(tmp_path, monkeypatch, capsys):
     def start(job):
         fill(job, 1)
-        job.process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+        job.process = reproduce.process(["-c", "import time; time.sleep(60)"], None)
+        signal.signal(signal.SIGINT, before)
 
+    # as behind nohup, or & in a script
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    begun = time.monotonic()
     monkeypatch.setattr(reproduce.Job, "start", start)
     monkeypatch.setitem(EXPERIMENTS, "hopper", [arm()])
     told = ["--experiments", "hopper", "--seeds", "0", "1", "--minutes", "0.02", "--commit", "abc"]
@@ -142,6 +148,7 @@ def test_it_stops_in_time_and_says_what_waits(tmp_path, monkeypatch, capsys):
     assert [(r["seed"], r["grounding_step"]) for r in rows] == [("0", "0"), ("0", "1")]
     assert {r["commit"] for r in rows} == {"abc"} and {r["version"] for r in rows} == {version()}
     assert "0 of 2 runs" in capsys.readouterr().out
+    assert time.monotonic() - begun < 30
 
 
 def test_a_table_that_is_none_is_told_in_one_line(tmp_path, capsys):
