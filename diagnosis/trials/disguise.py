@@ -12,7 +12,6 @@ from diagnosis.trials.prediction import model_residuals
 from diagnosis.trials.robots import to_mjcf
 
 REACH = 2.0  # a fitted value stays within this factor of the one it replaces
-WORTH = 0.01  # relative change below which a value is as good as right
 
 
 def disguise(nominal, true, items, runs, noise):
@@ -46,17 +45,16 @@ def disguise(nominal, true, items, runs, noise):
         loss="soft_l1",
         max_nfev=12,
     )
-    wrong, out = robot_at(found.x), []
-    for (index, field), value in zip(fields, found.x):
-        link = true.links[index]
-        if abs(value) > WORTH and field == "mass":
-            place = {"kind": "body", "name": link.name}
-            out.append(Item("mass", place, {"mass": link.mass}, required=False))
-        elif abs(value) > WORTH:
-            place = {"kind": "joint", "name": link.joint_name}
-            values = {"damping": link.damping}
-            out.append(Item("viscous_damping", place, values, required=False))
-    return wrong, out
+    return robot_at(found.x), [_right(true.links[index], field) for index, field in fields]
+
+
+def _right(link, field):
+    """The Item of a value that was fitted: what it should be."""
+    if field == "mass":
+        place = {"kind": "body", "name": link.name}
+        return Item("mass", place, {"mass": link.mass}, required=False)
+    place = {"kind": "joint", "name": link.joint_name}
+    return Item("viscous_damping", place, {"damping": link.damping}, required=False)
 
 
 def _fields(robot, items):

@@ -356,6 +356,18 @@ def _gate_name(laws):
     return None
 
 
+def told_item(item, nominal):
+    """An Item as findings tell it: a gain as a share of what the nominal model has, a bias as what
+    is added to that."""
+    told = item.to_json()
+    if item.effect in ("gain", "bias"):
+        [drive] = [a for a in nominal.actuators if a.name == item.place["name"]]
+        value = item.parameters[item.effect]
+        more = value / drive.gain if item.effect == "gain" else value - drive.bias
+        told["parameters"] = {item.effect: more}
+    return told
+
+
 def _answer(trial, kind, plan, settings):
     """The JSON-able answer of a trial, with the sizes over the noise in both sets of recordings."""
     sizes = {}
@@ -371,7 +383,7 @@ def _answer(trial, kind, plan, settings):
     return {
         **trial.answer,
         "kind": kind,
-        "hidden": [item.to_json() for item in trial.items],
+        "hidden": [told_item(item, trial.nominal) for item in trial.items],
         "over_noise": sizes["train"],
         "over_noise_held_out": sizes["held_out"],
         "settings": settings.name,

@@ -54,7 +54,7 @@ class Link:
 class Actuator:
     """A drive on the joint of link `link`.
 
-    kind: "motor": force = gain·u + bias; "position": gain·kp·(u − q) − kv·v + bias;
+    kind: "motor": force = gain·u + bias; "position": gain·(kp·(u − q) − kv·v) + bias;
     "velocity": gain·kv·(u − v) + bias. limit: largest force, N·m or N.
     """
 
@@ -398,7 +398,7 @@ def _actuator_line(robot, actuator, numbers):
     elif actuator.kind == "position":
         law = (
             f'gainprm="{gain * actuator.kp:.9g}" biastype="affine"'
-            f' biasprm="{actuator.bias:.9g} {-gain * actuator.kp:.9g} {-actuator.kv:.9g}"'
+            f' biasprm="{actuator.bias:.9g} {-gain * actuator.kp:.9g} {-gain * actuator.kv:.9g}"'
         )
     else:
         law = (

@@ -160,7 +160,7 @@ def _drive_law(effect, spot, size, robot, usage, unit):
     if effect == "dead_zone":
         width = size * load if servo else size * float(usage.control[a])
         law = L.DeadZone(i, actuator=a, width=0.5 * width, servo=servo)
-        return law, drive, {"half-width": law.width}
+        return law, drive, {"half_width": law.width}
     if effect == "back_emf":
         law = L.BackEmf(i, damping=2 * size * load / speed)
         return law, drive, {"damping": law.damping}

@@ -65,9 +65,7 @@ class TrueSystem:
         self.feed = term(lambda a: {"motor": 1.0, "position": a.kp, "velocity": a.kv}[a.kind])
         self.feed = self.feed * term(lambda a: a.gain)
         self.stiff = term(lambda a: a.gain * a.kp if a.kind == "position" else 0.0)
-        self.slow = term(
-            lambda a: {"motor": 0.0, "position": a.kv, "velocity": a.gain * a.kv}[a.kind]
-        )
+        self.slow = term(lambda a: 0.0 if a.kind == "motor" else a.gain * a.kv)
         self.bias = term(lambda a: a.bias)
         self.most = term(lambda a: a.limit)
         shape = len(links)
