@@ -17,6 +17,7 @@ ROOT = str(Path(__file__).resolve().parents[1])
 import rgat
 import train
 import trpo
+from diagnosis.common.atomic_files import write_whole
 from envs import BatchEnv, EnvError
 from models import GaussianPolicy
 from rgat import GroundedEnv
@@ -101,6 +102,14 @@ def diagnosed_once():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(physics_grounding, "diagnose", diagnose)
         yield
+
+
+@pytest.fixture(autouse=True)
+def drawn_end_to_end_alone(request, monkeypatch):
+    """Figures are a third of a small run's time: elsewhere a file stands for them."""
+    if "end_to_end" not in request.node.name:
+        stands = lambda run: write_whole(run.folder / "progress.png", b"a figure")
+        monkeypatch.setattr(run_folder.Run, "plot", stands)
 
 
 @pytest.fixture(scope="module")
