@@ -54,7 +54,7 @@ class Chain(Ahead):
         rough = self._rows({**self.coarse, **self.base}, self.begin)
         self.finer, self.beyond = self._rows({**step, **self.base}, self.begin) - rough, {}
         self.contacts = self._begun([self.windows[i] for i in self.touched], touching)
-        self.travel = self.whole.travel if len(self.touched) else np.full(self.model.nv, np.inf)
+        self.travel = np.where(touched[:, None, None], self.whole.travel, np.inf)
 
     def beginnings(self, number, seconds):
         """A Chain of the first seconds of so many of the windows, evenly chosen, which simulates an

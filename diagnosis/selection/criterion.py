@@ -19,6 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from diagnosis.common.distributions import t_sf
+from diagnosis.common.quadratic import bounded
 
 NOISE = 0.3  # of the noise, that counts as none
 BEYOND = 1.5  # of the noise, from which on an error counts
@@ -99,8 +100,8 @@ class Evidence:
         position = np.arange(residual[0].size).reshape(residual[0].shape)
         counted = np.zeros((len(residual), len(cells)))
         for j, (dofs, b) in enumerate(cells):
-            inside = ahead.known[..., dofs] & (ahead.band == b)[..., None]
-            finite = np.isfinite(ahead.noise[dofs])
+            finite = np.isfinite(ahead.noise[dofs])  # of what never moves no noise is known
+            inside = ahead.known[..., dofs] & finite & (ahead.band == b)[..., None]
             self.noise[j] = np.sqrt(np.mean(np.where(finite, ahead.noise[dofs], 0.0) ** 2))
             counted[:, j] = inside.sum((1, 2))
             for w in np.flatnonzero(counted[:, j]):
@@ -115,10 +116,13 @@ class Evidence:
         self.window_size = position.size  # rows by degrees of freedom
         self.square = self.squares((), np.zeros(0))
         self.reference = self.square if reference is None else reference
-        seen = (self.count > 0).any(0).sum()
-        self.cells = max(seen / max(self.channels, 1), 1 / groups)  # of a channel in a group
-        counting = self._counting(self.reference).sum() / max(seen, 1)
-        self.number = self.cells * max(counting, 1.0)
+        seen = (self.count > 0).any(0).reshape(self.channels, -1)
+        self.told = max(seen.any(1).sum(), 1)  # channels that are measured, and move
+        self.cells = max(seen.sum() / self.told, 1 / groups)  # of a channel in a group
+        # what a prior weighs against: errors where something is missing, not of joints that lack
+        # nothing, of which a large machine has many
+        counting = self._counting(self.reference).sum(0)
+        self.number = self.cells * max((counting**2).sum() / max(counting.sum(), 1e-300), 1.0)
 
     @cached_property
     def independent(self):
@@ -274,7 +278,7 @@ class Evidence:
         columns (p,): what a fit lowers."""
         square = self.squares(columns, amounts)
         log = np.where(self.count > 0, 0.5 * np.log(square + self.floor), 0.0)
-        return float(log.sum() / max((self.count > 0).sum(), 1) * self.channels)
+        return float(log.sum() / max((self.count > 0).sum(), 1) * self.told)
 
     def at(self, columns, amounts):
         """Score of given amounts (p,) of columns (p,)."""
@@ -381,32 +385,3 @@ class Evidence:
             curve -= (cross * np.linalg.solve(inside, cross.T).T).sum(1)
         seen = curve > 1e-9 * np.maximum(own, 1e-300)
         return np.where(seen, score**2 / np.where(seen, curve, 1.0) / 2, 0.0)
-
-
-def bounded(matrices, vectors, low, high):
-    """The minima (..., p) of x' matrix x / 2 - vector x between bounds (..., p), of matrices
-    (..., p, p) and vectors (..., p), by active sets of the bounds that are met."""
-    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", matrices), 1e-300))
-    eye, goal, (low, high) = np.eye(low.shape[-1]), vectors / scale, (low * scale, high * scale)
-    even = matrices / (scale[..., None] * scale[..., None, :]) + 1e-9 * eye
-    x, fixed = np.clip(np.zeros_like(goal), low, high), np.zeros(goal.shape, bool)
-    for _ in range(4 * len(eye) + 1):
-        free = ~fixed
-        inside = np.where(free[..., None] & free[..., None, :], even, eye)
-        push = np.where(free, goal - (even @ (x * fixed)[..., None])[..., 0], x)
-        step = np.linalg.solve(inside, push[..., None])[..., 0] - x
-        room = np.where(step > 0, high, low) - x
-        room = np.divide(room, step, out=np.full_like(x, np.inf), where=step != 0)
-        share = np.minimum(room.min(-1, initial=np.inf), 1.0)[..., None]
-        x = np.clip(x + share * step, low, high)
-        met = free & (share < 1) & (room <= share)
-        # where nothing is met, the bound that holds back most is left
-        slope = (even @ x[..., None])[..., 0] - goal
-        inward = np.where(x - low < high - x, -slope, slope) * (fixed & (low < high) & (share == 1))
-        most = inward.max(-1, initial=0.0, keepdims=True)
-        size = abs(goal).max(-1, initial=0.0, keepdims=True)
-        left = (inward == most) & (most > 1e-9 * size)
-        fixed = (fixed | met) & ~left
-        if not (met | left).any():
-            break
-    return x / scale

@@ -167,14 +167,13 @@ class Identification:
         for node in nodes:
             if len(chosen) == FINALISTS:
                 break
-            more = len(node.options) - len(start.options)
-            chance = not self.no_chance(paired(start.score, node.score), more)
-            if node.loss >= start.loss and chance:
-                continue
             options = beam.columns.options
             added = [options[k].candidate for k in node.options[len(start.options) :]]
             # a finer step is no other explanation, and curves of one joint's force are one
             added = [c for c in added if not c.effect.numerical] or added
+            chance = not self.no_chance(paired(start.score, node.score), len(added))
+            if node.loss >= start.loss and chance:
+                continue
             names = {c.place if isinstance(c.effect, Unknown) else c for c in added}
             same = [abs(node.score.groups - c.score.groups).max() < LEAST for c in chosen]
             if not any(same) and not any(names >= better for better in seen):
@@ -224,8 +223,8 @@ class Identification:
         """Whether a set is worth its complexity, and better by no chance among those looked at: an
         effect of it is one of many too."""
         step = paired(before.score, after.score)
-        added = len(after.setting.keys() - before.setting.keys())
-        return after.loss < before.loss and self.no_chance(step, added)
+        added = [c for c in after.setting.keys() - before.setting.keys() if not c.effect.numerical]
+        return after.loss < before.loss and self.no_chance(step, len(added))
 
     def no_chance(self, step, added=1):
         """Whether a Comparison is significant among all sets of so many different columns, with two

@@ -204,7 +204,8 @@ def plausible(candidate, usual):
         ratio = kind == "times"
         unit = abs(nominal[k]) if ratio else usual.unit(kind, candidate)
         shift = nominal[k] if candidate.effect.name in AWAY else 0.0
-        ends = np.array([a, b]) * unit * passing + shift if np.isfinite(unit) else (-np.inf, np.inf)
+        further = 1.0 if ratio else passing
+        ends = np.array([a, b]) * unit * further + shift if np.isfinite(unit) else (-np.inf, np.inf)
         scale[k] = s * unit if np.isfinite(s * unit) and s * unit > 0 else np.inf
         low[k], high[k] = max(min(ends), parameters[k].low), min(max(ends), parameters[k].high)
         if np.isfinite(nominal[k]):

@@ -61,14 +61,18 @@ def as_good(judged, best):
     """The Fitted sets, of several that were judged, that predict as well as the best one with other
     effects; the best SETS of them."""
     some = [f for f in judged if f.settled and _tied(f.score, best.score) and _instead(f, best)]
-    return sorted(some, key=lambda f: f.loss)[:SETS]
+    each = {}
+    for fitted in sorted(some, key=lambda f: f.loss):
+        each.setdefault(frozenset(fitted.setting), fitted)
+    return list(each.values())[:SETS]
 
 
 def carried(judge, sets, now, best):
     """Fitted sets of an earlier round, judged in this one: as they are, and with what the best set
     has more than there was."""
     new = {c: v for c, v in best.setting.items() if c not in now.setting}
-    tries = [f.setting for f in sets] + [{**new, **f.setting} for f in sets if new]
+    tries = [f.setting for f in sets]
+    tries += [{**new, **f.setting} for f in sets if new.keys() - f.setting.keys()]
     return [judge.fit(setting, steps=3, near=best) for setting in tries]
 
 
@@ -115,7 +119,8 @@ def _members(candidates, judge, before, fitted, candidate):
         if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
             continue
         tried = judge.fit(tried.setting)  # forces tell values better than the motion
-        lacks = missing.scores(tried.setting, fitted.setting)
+        apart = before.chain.apart(other) or before.chain.apart(candidate)
+        lacks = None if apart else missing.scores(tried.setting, fitted.setting)
         if lacks is None or _tied(*lacks):
             out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)

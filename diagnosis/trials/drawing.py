@@ -15,7 +15,7 @@ from diagnosis.trials import groups, hiding
 from diagnosis.trials.disguise import disguise
 from diagnosis.trials.experiment import Plan, channel_noise, record
 from diagnosis.trials.hiding import Usage
-from diagnosis.trials.laws import Air, ExternalForce, Gate, Law, Payload, Transmission
+from diagnosis.trials.laws import Gate, Law, Payload, Transmission
 from diagnosis.trials.oracle import visibility
 from diagnosis.trials.prediction import model_error, system_error
 from diagnosis.trials.robots import TOUCHES, Robot, draw_robot, loguniform, to_mjcf
@@ -58,9 +58,11 @@ class Trial:
         nominal."""
         kept = [k for k, owner in enumerate(self.owners) if owner != index]
         true = self.nominal
-        for k, change in enumerate(self.changes):
+        # values fitted wrong were right before anything was hidden
+        order = sorted(range(len(self.changes)), key=lambda k: self.items[k].required)
+        for k in order:
             if k != index:
-                true = change(true)
+                true = self.changes[k](true)
         return TrueSystem(true, [self.laws[k] for k in kept]), kept
 
 
@@ -136,7 +138,11 @@ def _hide_all(rng, kind, settings, robot, plan, usage, chosen, target):
         setters.append(_setter(effect, spot, item.parameters))
         owners += [len(items)] * len(more)
         alone = kind in ("single", "unknown")
-        laws += _gate(rng, more, plan, settings, usage) if alone else more
+        more = _gate(rng, more, plan, settings, usage) if alone else more
+        if any(isinstance(law, Gate) and law.within for law in more):
+            position = f"position:{robot.links[spot.link].joint_name}"
+            item = replace(item, needs=tuple(dict.fromkeys((*item.needs, position))))
+        laws += more
         items.append(item)
     answer = {"gate": _gate_name(laws), "plan": asdict(plan)}
     return Trial(answer, nominal, true, laws, items, owners, setters, [], [], noise)
@@ -333,7 +339,7 @@ def _gate(rng, laws, plan, settings, usage):
     if fate < 0.16:
         return [Gate(law, **gates[fate < 0.08]) for law in laws]
     quantiles = [usage.quantiles[law.link] for law in laws]
-    if any(isinstance(law, (Air, ExternalForce)) for law in laws):
+    if any(law.effect for law in laws):  # no name says where in the travel it acts
         return laws
     return [Gate(law, within=(float(q[25]), float(q[65]))) for law, q in zip(laws, quantiles)]
 
@@ -356,16 +362,23 @@ def _gate_name(laws):
     return None
 
 
-def told_item(item, nominal):
-    """An Item as findings tell it: a gain as a share of what the nominal model has, a bias as what
-    is added to that."""
-    told = item.to_json()
-    if item.effect in ("gain", "bias"):
-        [drive] = [a for a in nominal.actuators if a.name == item.place["name"]]
-        value = item.parameters[item.effect]
-        more = value / drive.gain if item.effect == "gain" else value - drive.bias
-        told["parameters"] = {item.effect: more}
-    return told
+def told_item(item, nominal, true):
+    """An Item as findings tell it: a gain as a share of what the nominal model has, which is in the
+    feedback of its servos too, and a bias as what is added to that."""
+    told, values = item.to_json(), item.parameters
+    if item.effect not in ("gain", "bias", "servo_stiffness", "servo_damping"):
+        return told
+    before, after = (
+        next(a for a in robot.actuators if a.name == item.place["name"])
+        for robot in (nominal, true)
+    )
+    if item.effect == "gain":
+        values = {"gain": values["gain"] / before.gain}
+    elif item.effect == "bias":
+        values = {"bias": values["bias"] - before.bias * after.gain / before.gain}
+    else:
+        values = {name: value * before.gain for name, value in values.items()}
+    return told | {"parameters": values}
 
 
 def _answer(trial, kind, plan, settings):
@@ -383,7 +396,7 @@ def _answer(trial, kind, plan, settings):
     return {
         **trial.answer,
         "kind": kind,
-        "hidden": [told_item(item, trial.nominal) for item in trial.items],
+        "hidden": [told_item(item, trial.nominal, trial.true) for item in trial.items],
         "over_noise": sizes["train"],
         "over_noise_held_out": sizes["held_out"],
         "settings": settings.name,

@@ -63,7 +63,7 @@ def visibility(trial, index, rows=700):
     bases = _start_bases(system.robot, runs, trial.noise, cuts)
     alone = apart = float(np.sum(_project(start, bases, cuts) ** 2))
     item = trial.items[index]
-    if alone >= ENOUGH:
+    if scale * alone >= ENOUGH:
         apart = _refit(system.robot, item, trial.noise, runs, residual, start, bases, cuts)
     return Visibility(round(scale * alone, 2), round(scale * min(apart, alone), 2))
 

@@ -131,18 +131,26 @@ def score_findings(answer, findings, seen=None):
 
 def assign(hidden, findings):
     """{hidden index: finding index}: one to one, as many first names as possible, then listed
-    ones."""
+    ones, then values that were fitted wrong and are put right."""
     if not hidden or not findings:
         return {}
     worth = np.zeros((len(hidden), len(findings)))
     for i, item in enumerate(hidden):
         for k, finding in enumerate(findings):
-            if names(finding, item):
-                worth[i, k] = 1000.0 - 0.01 * k
-            elif listed(finding, item):
-                worth[i, k] = 100.0 - 0.01 * k
+            first, among = names(finding, item), listed(finding, item)
+            if not item["required"]:
+                worth[i, k] = (first or among) and _puts_right(item, finding) and 1 - 0.01 * k
+            elif first or among:
+                worth[i, k] = (1000.0 if first else 100.0) - 0.01 * k
     rows, columns = linear_sum_assignment(-worth)
     return {int(i): int(k) for i, k in zip(rows, columns) if worth[i, k] > 0}
+
+
+def _puts_right(item, finding):
+    """Is what is said of a value that was fitted wrong right, or nearer to that?"""
+    told = [v for v in _match(0, item, 0, finding).values if not v.near]
+    moved = all(None not in (v.value, v.nominal) for v in told)
+    return moved and all(abs(v.value - v.truth) < abs(v.nominal - v.truth) for v in told)
 
 
 def names(finding, item):
@@ -252,10 +260,10 @@ class _Component(ValueScore):
 
 def _vector_scores(truth, told):
     scale = math.sqrt(sum(v * v for v in truth.values()))
-    for name, value in truth.items():
+    for name, truth in truth.items():
         p = told.get(name, {})
-        score = _Component(
-            name, float(value), p.get("value"), p.get("nominal"), p.get("low"), p.get("high")
-        )
+        low, value, nominal = p.get("low"), p.get("value"), p.get("nominal")
+        shown = None if low is None and value == nominal else value
+        score = _Component(name, float(truth), shown, nominal, low, p.get("high"))
         object.__setattr__(score, "scale", scale)
         yield score

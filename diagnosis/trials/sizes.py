@@ -122,6 +122,9 @@ def named_law(effect, spot, size, robot, usage, rng):
         law = L.Stribeck(
             i, coulomb=amount, static=amount * unit(1.5, 2.5), velocity=speed * unit(0.1, 0.3)
         )
+        dry = robot.links[i].frictionloss  # beside which the law acts, and which findings hold
+        more = {"coulomb": dry + law.coulomb, "static": dry + law.static}
+        return law, joint, {**law.parameters, **more}
     elif effect == "nonlinear_stiffness":
         law = L.CubicSpring(i, stiffness3=2 * amount / spread**3)
     elif effect == "spring_offset":

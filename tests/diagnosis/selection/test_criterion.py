@@ -3,10 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from plants import DRIVEN_PENDULUM
-from scipy.optimize import lsq_linear
 from scipy.stats import ttest_rel
 from synthetic import clustered, evidence_of, free, scene
 
@@ -14,7 +11,6 @@ from diagnosis.selection.criterion import (
     INDEPENDENT,
     ITERATIONS,
     Score,
-    bounded,
     complexity,
     paired,
 )
@@ -252,16 +248,21 @@ def test_a_first_look_is_the_gain_of_least_squares(moves):
         assert gains[k] == pytest.approx((left([1]) - left([1, k])) / 2, rel=0.05, abs=1e-3)
 
 
-@given(st.integers(0, 10**6), st.integers(1, 5))
-@settings(max_examples=200, deadline=None)
-def test_bounded_least_squares_are_scipys(seed, size):
-    rng = np.random.default_rng(seed)
-    x, y = rng.normal(size=(12, size)), rng.normal(size=12)
-    low = -rng.uniform(0, 0.3, size)
-    high = rng.uniform(0, 0.3, size)
-    found = bounded(x.T @ x, x.T @ y, low, high)
-    expected = lsq_linear(x, y, (low, high), method="bvls", tol=1e-12).x
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+def test_hypotheses_scored_together_are_those_scored_alone():
+    rng, ahead = np.random.default_rng(0), scene()
+    columns = rng.normal(size=(*ahead.known.shape, 5))
+    residual = columns @ np.array([3.0, 0, -2, 0, 0]) * 1e-2 + rng.normal(size=ahead.known.shape)
+    evidence = evidence_of(ahead, residual, columns)
+    given = []
+    for index in ((0,), (2,), (), (0, 2), (1, 3), (4,), (0, 2, 4)):
+        p = len(index)
+        low, high = -rng.uniform(0, 0.05, p), rng.uniform(0, 0.05, p)
+        given.append((index, low, high, rng.uniform(0, 9, p), rng.normal(size=p)))
+    for score, one in zip(evidence.scores(given), given):
+        alone = evidence.score(*one)
+        assert score.loss == pytest.approx(alone.loss, rel=1e-9)
+        np.testing.assert_allclose(score.groups, alone.groups, rtol=1e-9)
+        np.testing.assert_allclose(score.amounts, alone.amounts, atol=1e-9)
 
 
 def test_what_is_farther_from_the_first_things_to_think_of_and_freer_is_more_complex():
@@ -302,3 +303,16 @@ def test_room_is_the_loss_that_a_perfect_model_removes():
     room = evidence.room()
     assert removed == pytest.approx(room.sum(), rel=0.02) and room[0] > 2
     assert abs(room[1]) < 1e-9
+
+
+def test_a_prior_weighs_as_much_beside_joints_that_lack_nothing():
+    rng, numbers = np.random.default_rng(0), []
+    for channels in (1, 4):
+        ahead = scene(channels=channels, noise=1.0)
+        residual = rng.normal(size=ahead.known.shape)
+        residual[..., 0] *= 20
+        evidence = evidence_of(ahead, residual, np.zeros((*residual.shape, 0)))
+        prior = evidence.at((), np.zeros(0)).plus(1.0, evidence.number)
+        numbers.append(prior.loss)
+    assert numbers[1] == pytest.approx(numbers[0], rel=0.01)
+    assert numbers[0] == pytest.approx(1 / 16, rel=0.05)  # a cell in each of sixteen groups

@@ -23,7 +23,7 @@ class Named:
 DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)
 
 
-def chosen(monkeypatch, fitted, losses):
+def chosen(monkeypatch, fitted, losses, sensors=()):
     """(setting's names, {name: names of others}) after classes; losses: {name: unpriced loss} of
     sets of one effect."""
     names = {c.name: c for c in (DRY, CURVED)}
@@ -40,7 +40,9 @@ def chosen(monkeypatch, fitted, losses):
 
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
-    silent = SimpleNamespace(scores=lambda *settings: None, chain=SimpleNamespace(world=None))
+    chain = SimpleNamespace(world=None, apart=lambda c: c.name in sensors)
+    lacks = [Score(size, np.full(4, size), np.full(4, 4 * size), ()) for size in (1.0, 0.0)]
+    silent = SimpleNamespace(scores=lambda *settings: lacks if sensors else None, chain=chain)
     monkeypatch.setattr(rivals, "_near", lambda *args: [])
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
     monkeypatch.setattr(rivals, "_late", lambda *args: [])
@@ -68,6 +70,14 @@ def test_the_best_for_its_price_stands_and_what_predicts_as_well_is_told(
 ):
     found, told = chosen(monkeypatch, fitted, losses)
     assert found == [name] and told[name] == others
+
+
+def test_forces_speak_against_no_sensor(monkeypatch):
+    """A rival without a force of its own lacks all of it. That says nothing."""
+    close = {"stribeck": 0.0, "coulomb": 0.35}
+    assert chosen(monkeypatch, "coulomb", close, ["none"])[1] == {"coulomb": []}
+    for one in close:
+        assert chosen(monkeypatch, "coulomb", close, [one])[1] == {"coulomb": ["stribeck"]}
 
 
 def test_the_same_effect_in_a_like_place_is_tried_at_the_findings_own_value(monkeypatch):
@@ -132,6 +142,14 @@ def test_sets_of_an_earlier_round_are_judged_as_they_are_and_with_what_is_new():
     asked.clear()
     rivals.carried(judge, [set_of(-1.0, MASS)], BEST, BEST)
     assert asked == [({MASS}, BEST)]
+    asked.clear()
+    rivals.carried(judge, [set_of(-1.0, MASS, DAMPING)], now, BEST)
+    assert asked == [({MASS, DAMPING}, BEST)]  # it has what is new
+
+
+def test_the_same_effects_judged_twice_are_carried_on_once():
+    first, again = set_of(-1.95, MASS, ARMATURE), set_of(-1.96, ARMATURE, MASS)
+    assert rivals.as_good([BEST, first, again], BEST) == [again]
 
 
 def test_a_set_that_stands_for_several_findings_is_told_beside_each():

@@ -43,9 +43,13 @@ def hidden_in(effect, removed, number=2):
         spots = places(robot, effect)
         if robot.ground or not spots:
             continue
+        for i in range(len(robot.actuators)):  # what is told is relative to the nominal gain
+            robot = robot.with_actuator(i, gain=1.4)
         spot, usage = spots[rng.integers(len(spots))], usage_of(robot)
+        if effect == "stribeck_friction":  # beside what friction there is
+            robot = robot.with_link(spot.link, frictionloss=0.1 * usage.load[spot.link])
         nominal, true, laws, item = hide(effect, spot, size, removed, robot, robot, usage, rng)
-        out.append((nominal, true, laws, told_item(item, nominal)))
+        out.append((nominal, true, laws, told_item(item, nominal, true)))
     return out
 
 

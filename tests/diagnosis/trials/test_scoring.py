@@ -194,3 +194,35 @@ def test_coupled_joints_in_either_order():
     item = hidden("coupled_friction", "joint0+joint1", level=1.0)
     said = finding("coupled_friction", "joint1+joint0", level=(1.0, 0.9, 1.1))
     assert score([item], [said]).strict
+
+
+def test_a_value_that_was_fitted_wrong_takes_no_finding_from_what_is_asked_for():
+    asked = hidden("servo_damping", "drive0", "actuator", kv=2.0)
+    fitted = hidden("viscous_damping", required=False, damping=0.1)
+    other = {
+        "effect": "servo_damping",
+        "place": {"kind": "actuator", "name": "drive0"},
+        "parameters": [{"name": "kv", "nominal": 1.0, "value": 2.0}],
+    }
+    said = finding("viscous_damping", damping=(1.1, 1.0, 1.2), others=[other])
+    got = score([asked, fitted], [said])
+    assert got.strict and not got.matches[1].finding
+
+
+@pytest.mark.parametrize("value, right", [(1.0, True), (0.7, True), (-0.2, False), (2.5, False)])
+def test_a_value_that_was_fitted_wrong_may_be_put_right_and_not_made_worse(value, right):
+    said = finding("mass", "link0", "body", mass=(value, value - 0.1, value + 0.1))
+    got = score([hidden("mass", "link0", "body", required=False, mass=1.0)], [said])
+    assert got.strict == right and got.false == (() if right else (0,))
+
+
+def test_a_component_that_a_member_of_a_class_leaves_as_it_was_is_not_shown():
+    truth = hidden("inertia", "link0", "body", ixx=3.0, iyy=2.0, izz=0.1)
+    parts = [("ixx", 1.0, 3.01), ("iyy", 1.0, 1.0), ("izz", 0.1, 0.1)]
+    member = {
+        "effect": "inertia",
+        "place": truth["place"],
+        "parameters": [{"name": n, "nominal": a, "value": v} for n, a, v in parts],
+    }
+    said = finding("armature", armature=(1.0, 0.9, 1.1), others=[member])
+    assert score([truth], [said]).strict
