@@ -105,15 +105,7 @@ def named_law(effect, spot, size, robot, usage, rng):
         }[effect]()
         return law, joint, law.parameters
     if effect in ("coupled_friction", "coupled_inertia"):
-        pair = {
-            "kind": "joint",
-            "name": f"{robot.links[spot.other].joint_name}+{link.joint_name}",
-        }
-        if effect == "coupled_friction":
-            law = L.CoupledFriction(i, other=spot.other, level=amount, creep=0.01 * speed)
-            return law, pair, {"level": amount}
-        law = L.CoupledInertia(i, other=spot.other, inertia=2 * size * inertia)
-        return law, pair, {"inertia": 2 * size * inertia}
+        return _coupled_law(effect, spot, amount, 2 * size * inertia, 0.01 * speed, robot)
     if spot.actuator >= 0 and effect in OF_DRIVES and effect != "cogging":
         return _drive_law(effect, spot, size, robot, usage, unit)
     if effect == "quadratic_damping":
@@ -140,6 +132,17 @@ def named_law(effect, spot, size, robot, usage, rng):
     else:
         law = L.Presliding(i, frictionloss=amount, stiffness=amount / (spread * unit(0.02, 0.1)))
     return law, joint, law.parameters
+
+
+def _coupled_law(effect, spot, level, inertia, creep, robot):
+    """Laws in the sum of two joints."""
+    names = (robot.links[i].joint_name for i in (spot.other, spot.link))
+    pair = {"kind": "joint", "name": "+".join(names)}
+    if effect == "coupled_friction":
+        law = L.CoupledFriction(spot.link, other=spot.other, level=level, creep=creep)
+        return law, pair, {"level": level}
+    law = L.CoupledInertia(spot.link, other=spot.other, inertia=inertia)
+    return law, pair, {"inertia": inertia}
 
 
 def _drive_law(effect, spot, size, robot, usage, unit):
