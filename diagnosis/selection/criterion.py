@@ -327,7 +327,7 @@ class Evidence:
         begins at its errors would keep them. So it begins there, and where all groups weigh alike.
         """
         precision, pull, low, high = prior
-        nominal, best = self._grouped(products), None
+        nominal, found = self._grouped(products), []
         square = nominal[..., 0, 0] / np.maximum(self.count, 1)
         alike = (square * self.count).sum(-2, keepdims=True) / np.maximum(self.count.sum(0), 1)
         for begun in (square, np.broadcast_to(alike, square.shape)):
@@ -341,14 +341,10 @@ class Evidence:
             cost = np.einsum("bi,bij,bj->b", amounts, precision / 2, amounts)
             cost -= (amounts * pull).sum(-1)
             loss = 0.5 * np.log(begun + self.floor)[:, self.count > 0].sum(-1) + cost
-            found = loss, g, amounts
-            if best is None:
-                best = found
-            lower = loss < best[0]
-            best = tuple(
-                np.where(lower.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(found, best)
-            )
-        return best[1:]
+            found.append((loss, g, amounts))
+        (first, *one), (second, *other) = found
+        lower = second < first
+        return [np.where(lower.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(one, other)]
 
     def weight(self, g, amounts):
         """(G, cells): weights of squares at which least squares lowers the sum of logs."""

@@ -260,10 +260,10 @@ class _Component(ValueScore):
 
 def _vector_scores(truth, told):
     scale = math.sqrt(sum(v * v for v in truth.values()))
-    for name, truth in truth.items():
+    for name, true in truth.items():
         p = told.get(name, {})
         low, value, nominal = p.get("low"), p.get("value"), p.get("nominal")
         shown = None if low is None and value == nominal else value
-        score = _Component(name, float(truth), shown, nominal, low, p.get("high"))
+        score = _Component(name, float(true), shown, nominal, low, p.get("high"))
         object.__setattr__(score, "scale", scale)
         yield score

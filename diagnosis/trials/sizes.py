@@ -108,15 +108,15 @@ def named_law(effect, spot, size, robot, usage, rng):
         return _coupled_law(effect, spot, amount, 2 * size * inertia, 0.01 * speed, robot)
     if spot.actuator >= 0 and effect in OF_DRIVES and effect != "cogging":
         return _drive_law(effect, spot, size, robot, usage, unit)
-    if effect == "quadratic_damping":
-        law = L.QuadraticDamping(i, damping2=2 * amount / speed**2)
-    elif effect == "stribeck_friction":
+    if effect == "stribeck_friction":
         law = L.Stribeck(
             i, coulomb=amount, static=amount * unit(1.5, 2.5), velocity=speed * unit(0.1, 0.3)
         )
-        dry = robot.links[i].frictionloss  # beside which the law acts, and which findings hold
-        more = {"coulomb": dry + law.coulomb, "static": dry + law.static}
-        return law, joint, {**law.parameters, **more}
+        # findings tell the joint's whole friction, of which the law is a part
+        whole = {k: link.frictionloss + getattr(law, k) for k in ("coulomb", "static")}
+        return law, joint, {**law.parameters, **whole}
+    if effect == "quadratic_damping":
+        law = L.QuadraticDamping(i, damping2=2 * amount / speed**2)
     elif effect == "nonlinear_stiffness":
         law = L.CubicSpring(i, stiffness3=2 * amount / spread**3)
     elif effect == "spring_offset":
