@@ -81,7 +81,7 @@ def missing_most(world, outcome):
 def depends_on(model, candidate):
     """What an effect's force varies with, in the contract's words."""
     if isinstance(candidate.effect, Unknown):
-        return [v for v in (candidate.effect.variable, candidate.effect.factor) if v]
+        return list(candidate.effect.depends_on)
     variable, name = candidate.effect.acts_through, candidate.place.name
     if variable == "velocity" and candidate.place.kind == "actuator":
         actuator = model.actuator(name)

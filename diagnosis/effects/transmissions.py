@@ -29,7 +29,7 @@ from diagnosis.effects.joints import (
 
 LUGRE_STIFFNESS, LUGRE_LEVELS = 5, slice(3, 6)  # in a dcmotor's dynprm, and in its biasprm
 BRISTLE = 400.0  # 1/s², stiffness over inertia: a bristle to begin with
-STIFFEST = 0.1  # of inertia over a time step squared: stiffer bristles than the step carries
+STIFFEST = 1.0  # of inertia over a time step squared: stiffer bristles than the step carries
 RELAXES, FASTEST = (
     2.5,
     10.0,

@@ -31,8 +31,8 @@ class Unknown(JointEffect):
 
     variable: 'position:<joint>', 'velocity:<joint>', 'control:<actuator>', 'load:<joint>' (the
     force of its drives) or 'time'. factor: None, or what the curve is multiplied by:
-    'control:<actuator>' for what it is asked for (see asked), or 'velocity:<joint>' for its sign.
-    wave: a sine through two knots, a quarter of its period apart.
+    'control:<actuator>' for what it is asked for (see asked), 'velocity:<joint>' for its sign, or
+    'speed:<joint>' for its size. wave: a sine through two knots, a quarter of its period apart.
     """
 
     name, kind, simplicity = "unknown", "joint", 3
@@ -53,6 +53,12 @@ class Unknown(JointEffect):
 
     def __hash__(self):
         return hash(self._key())
+
+    @property
+    def depends_on(self):
+        """What the force varies with, in the contract's words."""
+        factor = (self.factor or "").replace("speed:", "velocity:")
+        return tuple(dict.fromkeys(v for v in (self.variable, factor) if v))
 
     def parameters(self, model, i):
         M = self.scale(model, i)
@@ -82,15 +88,17 @@ class Unknown(JointEffect):
             x, out = read(self.variable, *state), np.zeros_like(state[1])
             out[:, d] = self.at(x, values)
             if self.factor:
-                kind, _, name = self.factor.partition(":")
-                out[:, d] *= (
-                    asked(model, model.actuator(name).id, *state[:3])
-                    if kind == "control"
-                    else np.sign(read(self.factor, *state))
-                )
+                out[:, d] *= self._times(model, read, state)
             return out
 
         return curve
+
+    def _times(self, model, read, state):
+        """The factor (n,) at states."""
+        kind, _, name = self.factor.partition(":")
+        if kind == "control":
+            return asked(model, model.actuator(name).id, *state[:3])
+        return (abs if kind == "speed" else np.sign)(read(f"velocity:{name}", *state))
 
     def part(self, model, i, values):
         numbers = {

@@ -165,6 +165,8 @@ def _bounded(parameter):
 def _multiplied(curve):
     """(axis, note) of a force that is multiplied by a control, or by the sign of a velocity."""
     kind, _, name = curve["factor"].partition(":")
+    if kind == "speed":
+        return f"force per speed ({curve['unit']})", f"Acts times the speed of {name}."
     if kind == "velocity":
         note = f"Acts times the sign of the velocity of {name}."
         return f"force × sign ({curve['unit']})", note

@@ -163,9 +163,11 @@ def _earlier(out):
 
 
 def _csv(curve):
-    """A curve as it acts: its variable, what it is multiplied by, if anything (at -1 and at 1: it
-    is proportional), force."""
+    """A curve as it acts: its variable, what it is multiplied by, if anything (at -1, or 0, and at
+    1: it is proportional), force."""
     factor, levels = curve["factor"], (-1.0, 1.0) if curve["factor"] else (1.0,)
+    if factor and factor.startswith("speed"):
+        levels = (0.0, 1.0)
     head = [curve["variable"]] + ([_multiplier(factor)] if factor else []) + ["force"]
     rows = [
         [x, *([level] if factor else []), level * force]
@@ -179,6 +181,8 @@ def _csv(curve):
 
 
 def _multiplier(factor):
+    if factor.startswith("speed"):
+        return f"abs({factor.replace('speed', 'velocity')})"
     return f"sign({factor})" if factor.startswith("velocity") else factor
 
 

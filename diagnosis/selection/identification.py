@@ -5,7 +5,7 @@ found.fitted.setting; found.trajectory
 """
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import factorial
 
 import numpy as np
@@ -27,6 +27,9 @@ from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
+ABOVE = 1.0  # of its scatter, by which the force left follows something, for a search begun anew
+ELSEWHERE = 2  # sets at most from which the search is begun again
+ALIKE = 0.8  # cosine of what two sets leave, from which they leave the same
 CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
 ALONE = 4  # single effects that it judges beside them
@@ -58,6 +61,7 @@ class Identification:
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
         self.seen, self.missing, self.sets = {}, None, []
+        self.judged, self.ranking = None, []  # of the first round: sets that are earned; see Found
         self.looked = 1.0  # how many different columns a round looks at
         self.candidates = [
             c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
@@ -68,32 +72,69 @@ class Identification:
         self.say(0.0, "locating the missing force")
         self.smoother = smoother = Smoother(self.world, self.train)
         first = trajectory = smoother.locate({})
-        setting, ranking = setting or {}, []
+        setting = setting or {}
         if setting:
             trajectory = smoother.locate(setting, first, passes=1)
-        self.usual = Usual(self.world, self.train, smoother.scale, first.located()[0])
-        self.ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
-        self.screen = Chain(self.world, self.ahead.windows, smoother.position_noise)
+        known = first.located()[0], (first.qpos, first.qvel)
+        self.usual = Usual(self.world, self.train, smoother.scale, *known)
+        ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
+        self.windows = ahead, Chain(self.world, ahead.windows, smoother.position_noise)
+        found = self._rounds(setting, trajectory, first)
+        for other in self._elsewhere(found):
+            self.log(f" begun elsewhere: {said(other.setting)}")
+            self.missing, self.sets = None, []
+            start = smoother.locate(other.setting, first, passes=1)
+            again = self._rounds(other.setting, start, first)
+            if self._ends_better(again, found):
+                found = again
+        self._begin(found.fitted.setting, found.trajectory)
+        return replace(found, ranking=self.ranking)
+
+    def _begin(self, setting, trajectory):
+        """Windows that begin at a trajectory located under a setting."""
+        self.ahead, self.screen = (copy(windows) for windows in self.windows)
+        self.ahead.start(trajectory, setting)
+        self.screen.start(trajectory, setting)
+        self.trajectory = trajectory
+
+    def _rounds(self, setting, trajectory, first):
+        """The Found of rounds begun with a setting, and the trajectory located under it."""
         for i in range(ROUNDS):
-            self.ahead.start(trajectory, setting)
-            self.screen.start(trajectory, setting)
-            self.trajectory = trajectory
+            self._begin(setting, trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
             judge = self.judge()
-            fitted, better, look = self._round(setting, judge)
-            ranking = ranking or look
+            fitted, better = self._round(setting, judge)
             if not better:
                 break
             setting = fitted.setting
-            trajectory = smoother.locate(setting, trajectory, passes=1)
+            trajectory = self.smoother.locate(setting, trajectory, passes=1)
         else:  # rounds ended with a set from which nothing has begun
-            self.ahead.start(trajectory, setting)
-            self.screen.start(trajectory, setting)
+            self._begin(setting, trajectory)
             judge = self.judge()
             fitted = judge.fit(setting)
             self.sets = carried(judge, self.sets, fitted, fitted)
-        told = self.missing, ranking, self.sets
-        return Found(fitted, trajectory, first, smoother, self.usual, judge, *told)
+        known = trajectory, first, self.smoother, self.usual, judge
+        return Found(fitted, *known, self.missing, [], self.sets)
+
+    def _elsewhere(self, found):
+        """Fitted sets of the first round that leave something else than the best one did, best
+        first, where the force that the search left follows anything by more than it scatters: what
+        is taken first may hide what needs another beside it."""
+        left = dependences(self.world, found.trajectory, self.train, most=1)
+        if not left or left[0].above < ABOVE:
+            return []
+        physics = lambda f: {c for c in f.setting if not c.effect.numerical}
+        apart = []
+        for f in sorted(self.judged, key=lambda f: f.loss):
+            if all(abs(f.left @ other.left) < ALIKE for other in apart):
+                apart.append(f)
+        return [f for f in apart[1:] if not physics(f) <= physics(found.fitted)][:ELSEWHERE]
+
+    def _ends_better(self, again, found):
+        """Whether a Found is better than another one, and earned over the nominal model."""
+        self.log(f" ends {again.fitted.loss:.3f}, before {found.fitted.loss:.3f}")
+        better = again.fitted.settled and again.fitted.loss < found.fitted.loss - TIED
+        return better and self.earned(again.judge.fit({}), again.fitted)
 
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
@@ -107,7 +148,7 @@ class Identification:
         return Judge(ahead, self.usual, judge.reference, self.seen)
 
     def _round(self, setting, judge):
-        """(Fitted, whether it holds other effects than there were, first ranking)."""
+        """(Fitted, whether it holds other effects than there were)."""
         others = [c for c in self.candidates if c not in setting]
         every, curves = [*setting, *others], self._curves(setting)
         starts = Starts(self.world, setting, self.usual, self.seen, self.trajectory)
@@ -134,10 +175,12 @@ class Identification:
             judged.append(fitted)
             if not fitted.settled:  # what has no value may hide others that have
                 judged.append(judge.fit(fitted.inside, steps=3, near=fitted))
+        if self.judged is None:  # the first look of all
+            self.judged = [f for f in judged if f is not now and self.earned(now, f)]
+            self.ranking = self._ranking(beam, start, nodes)
         best = self._ended(judge, self._choose(judged, now), now)
         best = self._beside(judge, judged, now, best)
-        better = best.setting.keys() != setting.keys()
-        return best, better, [] if setting else self._ranking(beam, start, nodes)
+        return best, best.setting.keys() != setting.keys()
 
     def _beside(self, judge, judged, now, best):
         """The best set, or the one of an earlier round that is better with what is new; sets that

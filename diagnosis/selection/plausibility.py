@@ -122,17 +122,16 @@ class Usual:
     """What a machine usually does: force (nv,), speed (nv,) and travel (nv,) of each dof, forces
     asked of actuators."""
 
-    def __init__(self, world, recordings, force, missing=None):
-        """missing (nv,): RMS of the force that the nominal model lacks, where it is located."""
+    def __init__(self, world, recordings, force, missing=None, motion=None):
+        """missing (nv,): RMS of the force that the nominal model lacks, if it is located. motion:
+        (qpos, qvel) of all rows, smoothed; by default as they were measured."""
         model = world.model
-        states = [windowing.states(model, r) for r in recordings]
-        self.states, self.missing = states, missing
-        qvel = np.concatenate([v for _, v in states])
-        gone = [
-            windowing.difference(model, np.broadcast_to(model.qpos0, q.shape), q) for q, _ in states
-        ]
-        gone = np.concatenate(gone)
+        measured = zip(*(windowing.states(model, r) for r in recordings))
+        self.motion = motion or [np.concatenate(x) for x in measured]
+        qpos, qvel = self.motion
+        gone = windowing.difference(model, np.broadcast_to(model.qpos0, qpos.shape), qpos)
         self.model, self.force, self.recordings = model, force, recordings
+        self.missing = missing
         self.speed = np.sqrt(np.mean(qvel**2, axis=0)) + 1e-9
         self.travel = np.quantile(abs(gone), 0.95, axis=0) + 1e-9
         self.range = np.ptp(np.quantile(gone, [0.01, 0.99], axis=0), axis=0) + 1e-9
@@ -183,11 +182,12 @@ class Usual:
     def _times(self, curve):
         """RMS of what a curve is multiplied by."""
         kind, _, name = (curve.effect.factor or "").partition(":")
+        if kind == "speed":
+            return self.speed[self.model.joint(name).dofadr[0]]
         if kind != "control":
             return 1.0
-        i = self.model.actuator(name).id
-        each = zip(self.states, self.recordings)
-        told = np.concatenate([asked(self.model, i, q, v, r.ctrl) for (q, v), r in each])
+        ctrl = np.concatenate([r.ctrl for r in self.recordings])
+        told = asked(self.model, self.model.actuator(name).id, *self.motion, ctrl)
         return np.sqrt(np.nanmean(told**2)) + 1e-9
 
 

@@ -30,7 +30,8 @@ CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 @dataclass(frozen=True)
 class Dependence:
     """share: of the located force's variance at the joint that the curve predicts in stretches left
-    out; size: RMS of so much of it; candidate, values: the curve and the forces at its knots."""
+    out; size: RMS of so much of it; candidate, values: the curve and the forces at its knots;
+    above: size over the standard deviation of the located force."""
 
     joint: str
     variables: tuple
@@ -38,6 +39,7 @@ class Dependence:
     size: float
     candidate: object
     values: tuple
+    above: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -74,11 +76,11 @@ def dependences(world, trajectory, recordings, most=4, rows=True):
                     curve = _explained(force, x[keep], times[keep], block, variable, wave)
                     if curve.share > LEAST:
                         candidate = world.curve(name, variable, curve.knots, factor, wave)
-                        told = (variable,) + ((factor,) if factor else ())
-                        values = tuple(map(float, curve.values))
-                        each = Dependence(name, told, curve.share, curve.rms, candidate, values)
-                        found.append((curve.rms / scatter[d], each))
-    return [each for _, each in sorted(found, key=lambda pair: -pair[0])][:most]
+                        told = candidate.effect.depends_on
+                        values, above = tuple(map(float, curve.values)), curve.rms / scatter[d]
+                        of = curve.share, curve.rms
+                        found.append(Dependence(name, told, *of, candidate, values, above))
+    return sorted(found, key=lambda each: -each.above)[:most]
 
 
 def _axes(model, trajectory, ctrl, time):
@@ -98,11 +100,13 @@ def _axes(model, trajectory, ctrl, time):
 
 def _factors(model, trajectory, ctrl, j, variable):
     """{factor: (rows,)} of what a curve over a variable may be multiplied by: of the joint's own
-    and of time, the sign of its speed, as friction has, and what its drives are asked for."""
+    and of time, the sign of its velocity, as friction has, its speed, as what has to be moved has,
+    and what its drives are asked for."""
     name, out = windowing.joint_name(model, j), {None: np.ones(len(ctrl))}
     d = model.jnt_dofadr[j]
     if variable in ("time", f"position:{name}"):
         out[f"velocity:{name}"] = trajectory.direction()[:, d]
+        out[f"speed:{name}"] = abs(trajectory.qvel[:, d])
     if variable in ("time", f"position:{name}", f"velocity:{name}"):
         for a in drives_of(model, j):
             times = asked(model, a, trajectory.qpos, trajectory.qvel, ctrl)

@@ -158,7 +158,9 @@ def factor_of(look, factor):
     if factor is None:
         return 1.0
     kind, _, place = factor.partition(":")
-    return asked(look, place) if kind == "control" else np.sign(variable(look, factor))
+    if kind == "control":
+        return asked(look, place)
+    return (abs if kind == "speed" else np.sign)(look.velocity(place))
 
 
 def curve(look, joint, of, knots, forces, factor=None):

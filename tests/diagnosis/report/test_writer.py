@@ -103,6 +103,13 @@ def test_only_own_curves_are_removed(diagnosis, tmp_path):
             (-1.0, -0.2, 0.9),
             "position:elbow,sign(velocity:shoulder),force",
         ),
+        (
+            "position:elbow",
+            "speed:shoulder",
+            False,
+            (-1.0, -0.2, 0.9),
+            "position:elbow,abs(velocity:shoulder),force",
+        ),
         ("time", "control:elbow_motor", False, (0.0, 1.0, 3.0), "time,control:elbow_motor,force"),
         (
             "time",
@@ -131,7 +138,7 @@ def test_a_saved_curve_is_the_force_that_is_simulated(
         (q, v, u), t = rng.uniform(-0.9, 0.9, (3, 1, 2)), max(knots[0], 0.0) + rng.uniform(0, 2.9)
         x, times = (
             (t if variable == "time" else q[0, 1]),
-            {"": 1.0, "v": np.sign(v[0, 0]), "c": u[0, 1]}[(factor or "")[:1]],
+            {"": 1.0, "v": np.sign(v[0, 0]), "s": abs(v[0, 0]), "c": u[0, 1]}[(factor or "")[:1]],
         )
         some = rows[rows[:, 1] == 1] if factor else rows
         expected = force(q, v, u, np.array([t]))[0, 0]
@@ -139,7 +146,8 @@ def test_a_saved_curve_is_the_force_that_is_simulated(
             times * np.interp(x, some[:, 0], some[:, -1]), expected, atol=0.01 if wave else 1e-7
         )
         if factor:
-            np.testing.assert_allclose(rows[rows[:, 1] == -1, -1], -some[:, -1])
+            least = 0.0 if factor.startswith("speed") else -1.0
+            np.testing.assert_allclose(rows[rows[:, 1] == least, -1], least * some[:, -1])
     page = sections.html_page(diagnosis)
     assert ("Acts times the" in page) == bool(factor) and ("A sine of 0.800 s" in page) == wave
 

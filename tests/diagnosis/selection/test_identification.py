@@ -205,3 +205,50 @@ def test_what_became_nominal_is_no_finding(search):
     assert asked == [({friction: (0.1,)}, 0)]
     kept = SimpleNamespace(setting={friction: (0.1,)})
     assert identification.changing(judge, kept) is kept and len(asked) == 1
+
+
+def leaves(search, names, loss, angle):
+    """A Fitted that leaves a direction at an angle, in degrees, from that of others."""
+    told = fitted(search, names, loss)
+    told.left = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    return told
+
+
+def begun_elsewhere(search, monkeypatch, above, ended=("viscous_damping",)):
+    """First effects of the sets from which a search begins again that ended with some."""
+    left = [Dependence("elbow", ("time",), 0.9, 1.0, None, (), above)] if above else []
+    monkeypatch.setattr(identification, "dependences", lambda *args, most: left)
+    search.judged = [
+        leaves(search, ["coulomb_friction"], -1.0, 60),
+        leaves(search, ["viscous_damping", "stiffness"], -2.0, 0),
+        leaves(search, ["stribeck_friction"], -1.8, 20),  # leaves the same
+        leaves(search, ["armature"], -1.5, -60),
+    ]
+    found = SimpleNamespace(fitted=fitted(search, ended, -2.0), trajectory=None)
+    return [next(iter(f.setting)).effect.name for f in search._elsewhere(found)]
+
+
+def test_a_search_that_leaves_something_begins_again_where_something_else_was_left(
+    search, monkeypatch
+):
+    again = begun_elsewhere(search, monkeypatch, 1.5)
+    assert again == ["armature", "coulomb_friction"]  # best first
+    assert begun_elsewhere(search, monkeypatch, 0.9) == []  # what is left is within its scatter
+    assert begun_elsewhere(search, monkeypatch, None) == []
+    ended = begun_elsewhere(search, monkeypatch, 1.5, ("armature", "viscous_damping"))
+    assert ended == ["coulomb_friction"]  # not what it ended with
+
+
+@pytest.mark.parametrize(
+    "loss, settled, better",
+    [(-1.2, True, True), (-1.05, True, False), (-1.2, False, False), (-1.2, None, False)],
+)
+def test_another_end_is_taken_where_it_is_better_and_earned(search, loss, settled, better):
+    nothing = fitted(search, [], 0.0 if settled is not None else -2.0)
+    judge = SimpleNamespace(fit=lambda setting: nothing)
+    again = SimpleNamespace(fitted=fitted(search, ["armature"], 0.0, bool(settled)), judge=judge)
+    again.fitted.loss = loss
+    again.fitted.score = Score(loss, loss + 1e-3 * np.arange(16), 3 * loss * np.ones(16), ())
+    before = SimpleNamespace(fitted=fitted(search, ["coulomb_friction"], 0.0))
+    before.fitted.loss = -1.0
+    assert search._ends_better(again, before) == better

@@ -99,4 +99,18 @@ def test_a_force_without_a_name_is_about_as_large_as_what_is_missing():
     assert plausible(curve, usual).scale == pytest.approx([0.06, 0.06])
     asked = np.sqrt(np.mean(run.ctrl[:, 0] ** 2))
     assert plausible(times, usual).scale == pytest.approx([0.06 / asked] * 2)
+    grows = world.curve("pivot", "position:pivot", (0.0, 1.0), "speed:pivot")
+    speed = np.sqrt(np.mean(run.qvel[:, 0] ** 2))
+    assert plausible(grows, usual).scale == pytest.approx([0.06 / speed] * 2, rel=1e-6)
     assert np.isinf(plausible(curve, Usual(world, [run], np.array([0.5]))).scale).all()
+
+
+def test_what_is_usual_is_told_by_the_smoothed_motion():
+    """A velocity of noise alone is no speed."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    run = recorded("run.csv", 0)
+    smooth = np.zeros_like(run.qpos), np.full_like(run.qvel, 0.25)
+    usual = Usual(world, [run], np.array([0.5]), motion=smooth)
+    assert usual.speed == pytest.approx([0.25]) and usual.range == pytest.approx([0.0], abs=1e-8)
+    damping = world.candidate("viscous_damping", "pivot")
+    assert plausible(damping, usual).high == pytest.approx([5 * 0.5 / 0.25])

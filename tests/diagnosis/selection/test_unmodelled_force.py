@@ -73,6 +73,15 @@ def test_a_friction_over_the_travel_depends_on_position_and_on_the_sign_of_veloc
     assert found.variables == ("position:j", "velocity:j") and found.share > 0.8
 
 
+def test_a_ripple_that_grows_with_speed_depends_on_position_and_velocity():
+    law = lambda q, v, u, t: at(0, 0.1 * v[:, 0] ** 2 * np.sin(9 * q[:, 0]))
+    found = dependences(*made_up(law))[0]
+    assert found.variables == ("position:j", "velocity:j") and found.share > 0.7
+    assert found.candidate.effect.factor == "speed:j" and found.candidate.effect.wave
+    _, trajectory, _ = made_up(law)
+    assert found.above == pytest.approx(found.size / trajectory.located()[1][0])
+
+
 def test_ripples_of_what_a_drive_is_asked_for_are_a_wave_times_its_control():
     law = lambda q, v, u, t: at(0, 0.3 * u[:, 0] * np.sin(14 * q[:, 0] + 1))
     found = dependences(*made_up(law))[0]

@@ -54,6 +54,7 @@ def curves(world):
         {make("swing", "time", (0.1, 0.3, 0.4)): (0.1, 0.5, -0.3)},
         {make("elbow", "time", (0.1, 0.3), "control:bend"): (0.1, -0.2)},
         {make("elbow", "position:elbow", (-0.4, 0.1), "velocity:elbow"): (-0.1, -0.2)},
+        {make("elbow", "position:elbow", (0.0, 0.1), "speed:swing", wave=True): (0.3, 0.2)},
         {make("elbow", "time", (0.0, 0.05), wave=True): (0.3, 0.2)},
         {
             surface(
