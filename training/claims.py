@@ -13,7 +13,7 @@ from typing import Callable
 import numpy as np
 from scipy import stats
 
-from training.experiments import WIDTHS
+from training.experiments import WIDTHS, setting
 from training.results import SAME
 
 COLUMNS = (
@@ -271,6 +271,11 @@ BY_EXPERIMENT = {
             END.replace("90", "95"),
             reaches("solved, 1", share=0.95),
         ),
+    ],
+    "critical": [
+        ("max KL 1e-2 fails where 1e-4 learns", "text", MEAN, above(setting(kl=1e-4), setting())),
+        ("without entropy it fails", "text", MEAN, above(setting(), setting(entropy=0.0))),
+        ("gamma_AT 0.99 above 0", "text", MEAN, above(setting(gamma=0.99), setting())),
     ],
     "capacity": [
         ("shallow policies cannot do Hopper and HalfCheetah", "text", HALF, shallow_fails),

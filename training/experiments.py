@@ -71,11 +71,16 @@ def amounts(experiment, algos, counts, **shared):
     ]
 
 
+def setting(kl=1e-2, entropy=1e-5, gamma=0.0):
+    """The name of the arm with a setting of the transformer's TRPO, by default ours."""
+    return f"KL {kl:g}, H {entropy:g}, gamma {gamma:g}"
+
+
 def critical(experiment, **shared):
     """Section IV-D: trust region, entropy and discount of the transformer, end to end."""
     arms = []
     for kl, entropy, gamma in product((1e-4, 1e-3, 1e-2), (0.0, 1e-5, 1e-3), (0.0, 0.9, 0.99)):
-        name = f"KL {kl:g}, H {entropy:g}, gamma {gamma:g}"
+        name = setting(kl, entropy, gamma)
         at = {"at_max_kl": kl, "at_entropy": entropy, "at_gamma": gamma}
         arms.append(Arm(experiment, name, Settings(algo="rgat", **at, **shared)))
     return arms

@@ -28,7 +28,7 @@ from diagnosis.selection.unmodelled_force import dependences
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
 ABOVE = 1.0  # of its scatter, by which the force left follows something, for a search begun anew
-ELSEWHERE = 2  # sets at most from which the search is begun again
+ELSEWHERE = 1  # sets at most from which the search is begun again
 ALIKE = 0.8  # cosine of what two sets leave, from which they leave the same
 CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
@@ -84,7 +84,7 @@ class Identification:
             self.log(f" begun elsewhere: {said(other.setting)}")
             self.missing, self.sets = None, []
             start = smoother.locate(other.setting, first, passes=1)
-            again = self._rounds(other.setting, start, first)
+            again = self._rounds(other.setting, start, first, least=found.fitted.loss)
             if self._ends_better(again, found):
                 found = again
         self._begin(found.fitted.setting, found.trajectory)
@@ -97,14 +97,15 @@ class Identification:
         self.screen.start(trajectory, setting)
         self.trajectory = trajectory
 
-    def _rounds(self, setting, trajectory, first):
-        """The Found of rounds begun with a setting, and the trajectory located under it."""
+    def _rounds(self, setting, trajectory, first, least=np.inf):
+        """The Found of rounds begun with a setting, and the trajectory located under it; least: the
+        loss that the first round has to be below, for another."""
         for i in range(ROUNDS):
             self._begin(setting, trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
             judge = self.judge()
             fitted, better = self._round(setting, judge)
-            if not better:
+            if not better or fitted.loss >= least:
                 break
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory, passes=1)
