@@ -15,6 +15,7 @@ from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND, PRICE
 from diagnosis.selection.plausibility import at_limit, plausible
+from diagnosis.selection.unmodelled_force import ABOVE
 
 # of a joint's error, and of its force that follows anything, that names leave: they are the nearest
 NEAREST = 0.25
@@ -36,11 +37,11 @@ def left(fitted):
 
 
 def follows(outcome, joint):
-    """Share of the force that followed anything at a joint which still does so beside the names;
-    infinite where nothing did before."""
+    """Share of the force that followed anything at a joint which still does so beside the names, by
+    more than it scatters; infinite where nothing did before."""
     size = lambda found: next((d.size for d in found if d.joint == joint), 0.0)
     before = size(outcome.dependences)
-    return size(outcome.left) / before if before else np.inf
+    return size([d for d in outcome.left if d.above > ABOVE]) / before if before else np.inf
 
 
 def _standing_out(world, outcome, joints):

@@ -23,11 +23,10 @@ from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.rivals import TIED, as_good, carried
 from diagnosis.selection.starts import Starts
-from diagnosis.selection.unmodelled_force import dependences
+from diagnosis.selection.unmodelled_force import ABOVE, dependences
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
-ABOVE = 1.0  # of its scatter, by which the force left follows something, for a search begun anew
 ELSEWHERE = 1  # sets at most from which the search is begun again
 ALIKE = 0.8  # cosine of what two sets leave, from which they leave the same
 CURVES = 4  # that compete in a round, of those that a located force follows best

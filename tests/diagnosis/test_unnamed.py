@@ -38,7 +38,7 @@ def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)
     """errors: of the elbow, before and after, in ten noises; the shoulder errs by none. room: nats
     that a perfect model would remove in the shoulder and in the elbow. gone: what was not handed
     over."""
-    dependences = [SimpleNamespace(joint=j, variables=v, size=1.0) for j, v in depends]
+    dependences = [SimpleNamespace(joint=j, variables=v, size=1.0, above=2.0) for j, v in depends]
     before, after = (np.array([[1.0, 1.0, 100 * e**2, 100 * e**2]]) for e in errors)
     evidence = SimpleNamespace(
         count=np.ones((1, 4)),
@@ -96,12 +96,17 @@ def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequat
         assert only["evidence"]["held_out_error_removed"] == 0.4
 
 
-@pytest.mark.parametrize("size, effect", [(3.0, "coulomb_friction"), (5.0, "unknown")])
-def test_a_name_stands_where_what_it_leaves_follows_little(size, effect):
-    """Of a force of 16 that followed something, curves predict 3 or 5 beside the name."""
+@pytest.mark.parametrize(
+    "size, above, effect",
+    [(3.0, 2.0, "coulomb_friction"), (5.0, 2.0, "unknown"), (5.0, 0.9, "coulomb_friction")],
+)
+def test_a_name_stands_where_what_it_leaves_follows_little(size, above, effect):
+    """Of a force of 16 that followed something, curves predict 3 or 5 beside the name, by so much
+    of how far it scatters."""
     given = outcome(smoothed(1.0), (1.0, 0.7), DEPENDS)
     elsewhere, there = (SimpleNamespace(joint=j, size=16.0) for j in ("shoulder", "elbow"))
     given.dependences, given.left[0].size = [elsewhere, there], size
+    given.left[0].above = above
     [only] = unnamed.led(WORLD, given, [finding(FRICTION)], True)
     assert only["effect"] == effect
 
