@@ -102,11 +102,12 @@ def _checked(search, found, fitted, others, log):
     dependences = unmodelled_force.dependences(world, found.first, train, most=None)
     trajectory = found.trajectory
     left = unmodelled_force.dependences(world, trajectory, train, most=None)
-    for rest in left[:2]:
+    for rest in unmodelled_force.each_joint(left)[:2]:
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         # where no name is found, all that is told are a joint and a variable
         units = complexity([rest.candidate]) if mine else UNNAMED
-        beside = _beside(search, judge, fitted, rest, PRICE * units)
+        # what finer steps explain as well is no force
+        beside = _beside(search, judge, search.finer(judge, fitted), rest, PRICE * units)
         if not beside:
             continue
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
@@ -132,7 +133,10 @@ def _sometimes(search, found, fitted, log):
 def _named_there(search, found, fitted, where, log):
     """The Event of the effect that a search finds beside a Fitted set where a Condition holds."""
     world, judge = search.world, found.judge
-    there = Identification(world, where.parts(search.train), log=log)
+    parts = where.parts(search.train)
+    if not parts:
+        return None
+    there = Identification(world, parts, log=log)
     inside = there.run(fitted.setting)
     best, others = _classes(there, inside, inside.fitted, log, there.candidates)
     new = [c for c in best.setting if c not in fitted.setting and not c.effect.numerical]
@@ -238,6 +242,9 @@ def _hand_over(search, held, kept_back, outcome, log):
         outcome.strains[c] = _strain(c, v, plausible(c, found.usual))
     if set(kept) != set(found.fitted.setting):
         outcome.trajectory = found.smoother.locate(kept, outcome.trajectory, passes=1)
+        outcome.left = unmodelled_force.dependences(
+            world, outcome.trajectory, search.train, most=None
+        )
     check.locate(kept)
     outcome.held_check = check
     smoother = found.smoother

@@ -14,12 +14,12 @@ from diagnosis.estimation import prediction_error, windowing
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults
+from diagnosis.selection.unmodelled_force import each_joint
 from diagnosis.unnamed import depends_on, led
 
 SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing
 COLOURED = 3.0  # of its error under white noise, what noise of another kind may reach
 POINTS = 400  # of a located force that are told
-TOLD = 4  # dependences of it, those that stand out most
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,8 @@ def missing_force(world, outcome):
     """{joint: rms before and after, unit, what it depends on}: the force that the nominal model
     lacks."""
     out, model = {}, world.model
-    first, last, told = outcome.found.first, outcome.trajectory, outcome.dependences[:TOLD]
+    first, last = outcome.found.first, outcome.trajectory
+    told = each_joint(outcome.dependences)
     for j, kind, _, v in windowing.joint_slices(model):
         name = windowing.joint_name(model, j)
         for i, d in enumerate(range(v.start, v.stop)):

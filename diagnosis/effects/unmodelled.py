@@ -63,6 +63,8 @@ class Unknown(JointEffect):
     def parameters(self, model, i):
         M = self.scale(model, i)
         force = self.unit(model, i, "N·m", "N")
+        if (self.factor or "").startswith("speed"):
+            force = self.unit(model, i, "N·m·s/rad", "N·s/m")
         return tuple(
             Parameter(f"force {k}", force, 0.0, -HUGE * M, HUGE * M, 0.05 * M)
             for k in range(len(self.knots))
@@ -159,69 +161,6 @@ class Unknown(JointEffect):
         return None
 
 
-class UnknownSurface(JointEffect):
-    """A force in the joint over two variables: its values on a grid of knots, bilinear, flat
-    beyond.
-
-    variables: two, as of Unknown. knots: the grid's lines, (m,) and (n,). Parameters: m·n forces
-    in N·m (N), those of the first line first.
-    """
-
-    name, kind, simplicity = "unknown", "joint", 3
-
-    def __init__(self, variables, knots):
-        self.variables = tuple(variables)
-        self.knots = tuple(tuple(float(x) for x in line) for line in knots)
-
-    def _key(self):
-        return self.variables, self.knots
-
-    def __eq__(self, other):
-        return isinstance(other, UnknownSurface) and self._key() == other._key()
-
-    def __hash__(self):
-        return hash(self._key())
-
-    def parameters(self, model, i):
-        M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
-        return tuple(
-            Parameter(f"force {j}, {k}", force, 0.0, -HUGE * M, HUGE * M, 0.05 * M)
-            for j in range(len(self.knots[0]))
-            for k in range(len(self.knots[1]))
-        )
-
-    def _weights(self, line, x):
-        """Cell (S,) on a line of knots, and how far in it, 0 to 1."""
-        line = np.array(line)
-        k = np.clip(np.searchsorted(line, x) - 1, 0, len(line) - 2)
-        return k, np.clip((x - line[k]) / (line[k + 1] - line[k]), 0.0, 1.0)
-
-    def force(self, models, i, values):
-        d, read, rows = models[0].jnt_dofadr[i], reader(models), np.arange(len(values))
-        grid = values.reshape(len(values), len(self.knots[0]), len(self.knots[1]))
-
-        def surface(*state):
-            (j, f), (k, g) = (
-                self._weights(line, read(variable, *state))
-                for line, variable in zip(self.knots, self.variables)
-            )
-            out = np.zeros_like(state[1])
-            for a, p in ((j, 1 - f), (j + 1, f)):
-                out[:, d] += p * ((1 - g) * grid[rows, a, k] + g * grid[rows, a, k + 1])
-            return out
-
-        return surface
-
-    def write(self, spec, model, i, values):
-        return "python"
-
-    def part(self, model, i, values):
-        forces = np.reshape(values, [len(line) for line in self.knots]).tolist()
-        knots = [list(line) for line in self.knots]
-        numbers = {"of": list(self.variables), "knots": knots, "forces": forces}
-        return Part("surface", model.joint(i).name, numbers)
-
-
 def reader(models):
     """Function (variable, qpos, qvel, ctrl, time) -> (S,) its values; see Unknown."""
     model, torques = models[0], {}
@@ -240,12 +179,6 @@ def reader(models):
         return qpos[:, joint.qposadr[0]] if kind == "position" else qvel[:, joint.dofadr[0]]
 
     return read
-
-
-def surface(model, joint, variables, knots):
-    """Candidate for an unknown force over two variables: see UnknownSurface."""
-    effect = UnknownSurface(variables, knots)
-    return Candidate(effect, Place("joint", joint), effect.parameters(model, model.joint(joint).id))
 
 
 def holds(force, x, y, zero):

@@ -6,6 +6,7 @@ curves = unknown_curves(diagnosis)       # those of findings without a name
 
 import math
 
+import mujoco
 import numpy as np
 
 from diagnosis.recordings import inverse_dynamics
@@ -107,7 +108,7 @@ def _constancy(finding):
 
 def unknown_curves(diagnosis: Diagnosis) -> list[dict]:
     """The fitted curves of findings that the catalogue cannot name, one dict each: finding (index),
-    variable, factor, period (s, of a sine, or None), x, force (n,), unit. Force between
+    variable, factor, period (of a sine, in words, or None), x, force (n,), unit. Force between
     neighbouring x is linear; a sine spans all recordings."""
     curves = []
     for index, finding in enumerate(diagnosis.summary["findings"]):
@@ -123,8 +124,10 @@ def _sampled(diagnosis, candidate, values):
     effect, period = candidate.effect, None
     if effect.wave:
         period = 4 * (effect.knots[1] - effect.knots[0])
-        times = np.concatenate([r.time for r in [*diagnosis.train, *diagnosis.held_out]])
-        x = np.arange(times.min(), times.max() + period / PER_PERIOD, period / PER_PERIOD)
+        course, unit = _course(diagnosis, effect.variable)
+        low, high = np.nanmin(course), np.nanmax(course)
+        x = np.arange(low, high + period / PER_PERIOD, period / PER_PERIOD)
+        period = f"{text.number(period)} {unit}"
     else:
         even = np.linspace(effect.knots[0], effect.knots[-1], PER_CURVE)
         x = np.union1d(effect.knots, even)
@@ -138,20 +141,31 @@ def _sampled(diagnosis, candidate, values):
     }
 
 
+def _course(diagnosis, variable):
+    """(what was recorded of time, or of a joint's position (n,), its unit)."""
+    runs, (kind, _, name) = [*diagnosis.train, *diagnosis.held_out], variable.partition(":")
+    if kind == "time":
+        return np.concatenate([r.time for r in runs]), "s"
+    joint = diagnosis.world.model.joint(name)
+    unit = "m" if joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+    return np.concatenate([r.qpos[:, joint.qposadr[0]] for r in runs]), unit
+
+
 def _curve(curve, parameters):
     """The unknown force against its variable, with the 95 % interval of what is linear between
     knots."""
     x, force, lines, note = curve["x"], curve["force"], [], ""
     if curve["period"]:
         x, force = x[: 3 * PER_PERIOD + 1], force[: 3 * PER_PERIOD + 1]
-        note = f"A sine of {text.number(curve['period'])} s."
+        note = f"A sine of {curve['period']}."
     elif all(p.get("at") is not None and _bounded(p) for p in parameters):
         at = [p["at"] for p in parameters]
         band = [np.interp(x, at, [p[bound] for p in parameters]) for bound in ("low", "high")]
         lines = [Series(x, np.stack(band, axis=1), "corrected", "band")]
     label = f"force ({curve['unit']})"
     if curve["factor"]:
-        label, note = _multiplied(curve)
+        label, times = _multiplied(curve)
+        note = f"{note} {times}".strip()
     axis = text.axis_words(curve["variable"])
     lines.append(Series(x, force, "corrected"))
     return {"svg": chart(lines, axis, label, label="the unknown force"), "note": note, "looks": []}
@@ -163,10 +177,10 @@ def _bounded(parameter):
 
 
 def _multiplied(curve):
-    """(axis, note) of a force that is multiplied by a control, or by the sign of a velocity."""
+    """(axis, note) of a force that is multiplied by a control, a speed, or its sign."""
     kind, _, name = curve["factor"].partition(":")
     if kind == "speed":
-        return f"force per speed ({curve['unit']})", f"Acts times the speed of {name}."
+        return f"force / speed ({curve['unit']})", f"Acts times the speed of {name}."
     if kind == "velocity":
         note = f"Acts times the sign of the velocity of {name}."
         return f"force × sign ({curve['unit']})", note

@@ -81,12 +81,14 @@ class Identification:
         found = self._rounds(setting, trajectory, first)
         for other in self._elsewhere(found):
             self.log(f" begun elsewhere: {said(other.setting)}")
-            self.missing, self.sets = None, []
-            start = smoother.locate(other.setting, first, passes=1)
-            again = self._rounds(other.setting, start, first, least=found.fitted.loss)
-            if self._ends_better(again, found):
+            search = copy(self)  # what it finds out is kept where it ends better
+            search.smoother, search.missing, search.sets = copy(smoother), None, []
+            start = search.smoother.locate(other.setting, first, passes=1)
+            again = search._rounds(other.setting, start, first, rival=found.fitted.setting)
+            again = search._better_end(again, found)
+            if again:
                 found = again
-        self._begin(found.fitted.setting, found.trajectory)
+                vars(self).update(vars(search))
         return replace(found, ranking=self.ranking)
 
     def _begin(self, setting, trajectory):
@@ -96,21 +98,22 @@ class Identification:
         self.screen.start(trajectory, setting)
         self.trajectory = trajectory
 
-    def _rounds(self, setting, trajectory, first, least=np.inf):
-        """The Found of rounds begun with a setting, and the trajectory located under it; least: the
-        loss that the first round has to be below, for another."""
+    def _rounds(self, setting, trajectory, first, rival=None):
+        """The Found of rounds begun with a setting, and the trajectory located under it; rival: a
+        setting than which each round has to end better, for another."""
         for i in range(ROUNDS):
             self._begin(setting, trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
             judge = self.judge()
             fitted, better = self._round(setting, judge)
-            if not better or fitted.loss >= least:
+            if not better or (rival and judge.fit(rival).loss <= fitted.loss):
                 break
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory, passes=1)
         else:  # rounds ended with a set from which nothing has begun
             self._begin(setting, trajectory)
             judge = self.judge()
+            self.missing = MissingForce(self.screen, setting, self.missing)
             fitted = judge.fit(setting)
             self.sets = carried(judge, self.sets, fitted, fitted)
         known = trajectory, first, self.smoother, self.usual, judge
@@ -123,18 +126,21 @@ class Identification:
         left = dependences(self.world, found.trajectory, self.train, most=1)
         if not left or left[0].above < ABOVE:
             return []
-        physics = lambda f: {c for c in f.setting if not c.effect.numerical}
         apart = []
         for f in sorted(self.judged, key=lambda f: f.loss):
             if all(abs(f.left @ other.left) < ALIKE for other in apart):
                 apart.append(f)
-        return [f for f in apart[1:] if not physics(f) <= physics(found.fitted)][:ELSEWHERE]
+        return [f for f in apart[1:] if physics(f.setting) - set(found.fitted.setting)][:ELSEWHERE]
 
-    def _ends_better(self, again, found):
-        """Whether a Found is better than another one, and earned over the nominal model."""
-        self.log(f" ends {again.fitted.loss:.3f}, before {found.fitted.loss:.3f}")
-        better = again.fitted.settled and again.fitted.loss < found.fitted.loss - TIED
-        return better and self.earned(again.judge.fit({}), again.fitted)
+    def _better_end(self, again, found):
+        """A Found without what it does not need, if that is better than another one by its own
+        judge, and earned over the nominal model in finer steps; or None."""
+        judge, before = again.judge, again.judge.fit(found.fitted.setting)
+        nothing = self.finer(judge, judge.fit({}))
+        fitted = self.pruned(judge, again.fitted, nothing)
+        self.log(f" ends {fitted.loss:.3f}, before {before.loss:.3f}")
+        better = fitted.settled and fitted.loss < before.loss - TIED
+        return replace(again, fitted=fitted) if better and self.earned(nothing, fitted) else None
 
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
@@ -176,7 +182,9 @@ class Identification:
             if not fitted.settled:  # what has no value may hide others that have
                 judged.append(judge.fit(fitted.inside, steps=3, near=fitted))
         if self.judged is None:  # the first look of all
-            self.judged = [f for f in judged if f is not now and self.earned(now, f)]
+            bare = [f for f in judged if f.settled and not physics(f.setting) - set(setting)]
+            least = min([now, *bare], key=lambda f: f.loss)
+            self.judged = [f for f in judged if f.settled and self.earned(least, f)]
             self.ranking = self._ranking(beam, start, nodes)
         best = self._ended(judge, self._choose(judged, now), now)
         best = self._beside(judge, judged, now, best)
@@ -259,6 +267,9 @@ class Identification:
         """What a round ends with: the best set without what it does not need, or what there was."""
         if best is not now:
             best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
+            # what finer steps alone explain as well is no physics
+            if physics(best.setting) - set(now.setting):
+                best = best if self.earned(self.finer(judge, now), best) else now
             self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         return best
 
@@ -266,7 +277,7 @@ class Identification:
         """Whether a set is worth its complexity, and better by no chance among those looked at: an
         effect of it is one of many too."""
         step = paired(before.score, after.score)
-        added = [c for c in after.setting.keys() - before.setting.keys() if not c.effect.numerical]
+        added = physics(after.setting.keys() - before.setting.keys())
         return after.loss < before.loss and self.no_chance(step, len(added))
 
     def no_chance(self, step, added=1):
@@ -344,6 +355,11 @@ def changing(judge, fitted):
     same = [c for c, v in fitted.setting.items() if np.allclose(v, c.nominal, rtol=1e-6, atol=0)]
     rest = {c: v for c, v in fitted.setting.items() if c not in same}
     return judge.fit(rest, steps=0) if same else fitted
+
+
+def physics(candidates):
+    """The set of candidates without a finer time step."""
+    return {c for c in candidates if not c.effect.numerical}
 
 
 def squares(ahead, residual=None):

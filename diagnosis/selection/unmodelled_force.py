@@ -84,6 +84,14 @@ def dependences(world, trajectory, recordings, most=4, rows=True):
     return sorted(found, key=lambda each: -each.above)[:most]
 
 
+def each_joint(found):
+    """The first of the Dependences of each joint, in their order."""
+    best = {}
+    for each in found:
+        best.setdefault(each.joint, each)
+    return list(best.values())
+
+
 def _axes(model, trajectory, ctrl, time):
     """{variable: (rows,)} of everything at hand that moves."""
     axes = {"time": time}

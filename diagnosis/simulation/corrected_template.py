@@ -154,7 +154,7 @@ def asked(look, actuator):
 
 
 def factor_of(look, factor):
-    """What a curve is multiplied by: 1, what an actuator is asked for, or the sign of a speed."""
+    """What a curve is multiplied by: 1, what an actuator is asked for, a speed, or its sign."""
     if factor is None:
         return 1.0
     kind, _, place = factor.partition(":")
@@ -179,18 +179,6 @@ def stribeck_release(look, joint, fall, velocity):
     v."""
     v = look.velocity(joint)
     return -fall * np.expm1(-((v / velocity) ** 2)) * np.sign(v)
-
-
-def surface(look, joint, of, knots, forces):
-    """A force over two variables: bilinear between knots, flat beyond them."""
-    forces, weights = np.asarray(forces), []
-    for name, at in zip(of, knots):
-        at, x = np.asarray(at), np.asarray(variable(look, name))
-        k = np.clip(np.searchsorted(at, x) - 1, 0, len(at) - 2)
-        weights.append((k, np.clip((x - at[k]) / (at[k + 1] - at[k]), 0.0, 1.0)))
-    (i, f), (j, g) = weights
-    low = (1 - g) * forces[i, j] + g * forces[i, j + 1]
-    return (1 - f) * low + f * ((1 - g) * forces[i + 1, j] + g * forces[i + 1, j + 1])
 
 
 # what a drive loses of its force; the place is the actuator
@@ -263,7 +251,7 @@ def effort_fade(look, wanted, memory, tires):
 
 
 FRICTION = {f.__name__: f for f in (stribeck_rest, load_friction, friction_wave, friction_curve)}
-FORCE = {f.__name__: f for f in (curve, wave, surface, stribeck_release)}
+FORCE = {f.__name__: f for f in (curve, wave, stribeck_release)}
 DRIVE = {f.__name__: f for f in (dead_zone_of_force, torque_speed, gain_fade)}
 CONTROL = {f.__name__: f for f in (dead_zone, rate_limit, effort_fade, delay, lag)}
 

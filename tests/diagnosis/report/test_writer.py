@@ -119,6 +119,13 @@ def test_only_own_curves_are_removed(diagnosis, tmp_path):
             "time,control:elbow_motor,force",
         ),
         ("time", None, True, (0.0, 0.2), "time,force"),
+        (
+            "position:elbow",
+            "speed:shoulder",
+            True,
+            (0.0, 0.2),
+            "position:elbow,abs(velocity:shoulder),force",
+        ),
     ],
 )
 def test_a_saved_curve_is_the_force_that_is_simulated(
@@ -134,8 +141,13 @@ def test_a_saved_curve_is_the_force_that_is_simulated(
     assert (tmp_path / "unknown_1.csv").read_text().splitlines()[0] == header
     rows = np.loadtxt(tmp_path / "unknown_1.csv", delimiter=",", skiprows=1)
     force = candidate.effect.force([model], 0, values[None])
+    travel = (
+        [r.qpos[:, 1] for r in [*diagnosis.train, *diagnosis.held_out]] if wave else [0.9, -0.9]
+    )
+    low, high = np.min(travel), np.max(travel)  # a wave is told over what was recorded
     for _ in range(50):
         (q, v, u), t = rng.uniform(-0.9, 0.9, (3, 1, 2)), max(knots[0], 0.0) + rng.uniform(0, 2.9)
+        q[0, 1] = np.clip(q[0, 1], low, high)
         x, times = (
             (t if variable == "time" else q[0, 1]),
             {"": 1.0, "v": np.sign(v[0, 0]), "s": abs(v[0, 0]), "c": u[0, 1]}[(factor or "")[:1]],
@@ -149,7 +161,8 @@ def test_a_saved_curve_is_the_force_that_is_simulated(
             least = 0.0 if factor.startswith("speed") else -1.0
             np.testing.assert_allclose(rows[rows[:, 1] == least, -1], least * some[:, -1])
     page = sections.html_page(diagnosis)
-    assert ("Acts times the" in page) == bool(factor) and ("A sine of 0.800 s" in page) == wave
+    assert ("Acts times the" in page) == bool(factor) and ("A sine of 0.800 " in page) == wave
+    assert ("A sine of 0.800 rad" in page) == (wave and variable != "time")
 
 
 @pytest.mark.parametrize("fails", ["fsync", "replace"])

@@ -243,12 +243,88 @@ def test_a_search_that_leaves_something_begins_again_where_something_else_was_le
     "loss, settled, better",
     [(-1.2, True, True), (-1.05, True, False), (-1.2, False, False), (-1.2, None, False)],
 )
-def test_another_end_is_taken_where_it_is_better_and_earned(search, loss, settled, better):
+def test_another_end_is_taken_where_it_is_better_and_earned(
+    search, monkeypatch, loss, settled, better
+):
     nothing = fitted(search, [], 0.0 if settled is not None else -2.0)
-    judge = SimpleNamespace(fit=lambda setting: nothing)
+    before = SimpleNamespace(fitted=fitted(search, ["coulomb_friction"], 9.0))
+    same = fitted(search, ["coulomb_friction"], 0.0)  # by the judge of the other search
+    same.loss = -1.0
+    judge = SimpleNamespace(fit=lambda setting: same if setting else nothing)
     again = SimpleNamespace(fitted=fitted(search, ["armature"], 0.0, bool(settled)), judge=judge)
     again.fitted.loss = loss
     again.fitted.score = Score(loss, loss + 1e-3 * np.arange(16), 3 * loss * np.ones(16), ())
-    before = SimpleNamespace(fitted=fitted(search, ["coulomb_friction"], 0.0))
-    before.fitted.loss = -1.0
-    assert search._ends_better(again, before) == better
+    monkeypatch.setattr(search, "finer", lambda judge, fitted: fitted)
+    monkeypatch.setattr(search, "pruned", lambda judge, fitted, now: fitted)
+    monkeypatch.setattr(identification, "replace", lambda found, fitted: found)
+    assert search._better_end(again, before) is (again if better else None)
+
+
+def test_rounds_begun_elsewhere_go_on_only_where_they_are_better(search, monkeypatch):
+    best, asked = fitted(search, ["armature"], -1.0), []
+    monkeypatch.setattr(search, "_begin", lambda *given: None)
+    search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
+    round_of = lambda setting, judge: (asked.append(setting) or best, len(asked) < 2)
+    monkeypatch.setattr(search, "_round", round_of)
+    rival = fitted(search, ["coulomb_friction"], 0.0)
+    judge = SimpleNamespace(fit=lambda setting: rival)
+    monkeypatch.setattr(search, "judge", lambda: judge)
+    for loss, given, rounds in (
+        (best.loss, rival.setting, 1),
+        (best.loss + 0.1, rival.setting, 2),
+        (best.loss, None, 2),
+    ):
+        rival.loss = loss
+        asked.clear()
+        found = search._rounds({}, "located", "first", rival=given)
+        assert asked == [{}, best.setting][:rounds] and found.fitted is best
+        assert found.trajectory == ["located", "moved"][rounds - 1]
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_what_a_search_begun_elsewhere_finds_out_is_kept_where_it_ends_better(
+    search, monkeypatch, better
+):
+    ends = iter(["first search", "second search"])
+    monkeypatch.setattr(identification, "Smoother", lambda *given: Located())
+    monkeypatch.setattr(identification, "Usual", lambda *given: None)
+    monkeypatch.setattr(identification, "cut_ahead", lambda runs: [])
+    for name in ("Ahead", "Chain"):
+        monkeypatch.setattr(identification, name, lambda *given: SimpleNamespace(windows=[]))
+    monkeypatch.setattr(identification, "replace", lambda found, ranking: found)
+
+    def rounds(self, setting, trajectory, first, rival=None):
+        self.looked, self.sets, self.smoother.noise = self.looked + 1, [setting], setting
+        return SimpleNamespace(fitted=SimpleNamespace(setting={"found": 1}), name=next(ends))
+
+    other = SimpleNamespace(setting={search.world.candidates[0]: (1.0,)})
+    monkeypatch.setattr(Identification, "_rounds", rounds)
+    monkeypatch.setattr(search, "_elsewhere", lambda found: [other])
+    end = lambda self, again, found: again if better else None
+    monkeypatch.setattr(Identification, "_better_end", end)
+    assert search.run().name == ("second search" if better else "first search")
+    kept = other.setting if better else {}
+    assert search.looked == 41.0 + better and search.sets == [kept]
+    assert search.smoother.noise == kept
+
+
+class Located:
+    """A Smoother that locates nothing."""
+
+    position_noise = scale = noise = None
+
+    def locate(self, *given, **how):
+        return SimpleNamespace(located=lambda: [None], qpos=None, qvel=None)
+
+
+def test_what_finer_steps_explain_as_well_is_no_physics(search, monkeypatch):
+    now, armature = fitted(search, [], 0.0), fitted(search, ["armature"], -1.0)
+    fine = fitted(search, [], -1.5)
+    monkeypatch.setattr(search, "further", lambda judge, best: best)
+    monkeypatch.setattr(search, "pruned", lambda judge, best, now: best)
+    monkeypatch.setattr(search, "finer", lambda judge, best: fine if best is now else best)
+    assert search._ended(None, armature, now) is now
+    fine.loss, fine.score = now.loss, now.score  # finer steps explain nothing
+    assert search._ended(None, armature, now) is armature
+    step = SimpleNamespace(setting={search.world.candidate("time_step", "world"): ()}, loss=-1.0)
+    assert search._ended(None, step, now) is step

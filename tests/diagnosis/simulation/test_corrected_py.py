@@ -16,7 +16,6 @@ from plants import DT, SIZES, START, T, arm, commanded, pendulum, record, simula
 
 from diagnosis.effects.base import Part
 from diagnosis.effects.friction import friction_curve
-from diagnosis.effects.unmodelled import surface
 from diagnosis.simulation.corrected_py import (
     CorrectedBatch,
     ScriptError,
@@ -45,7 +44,6 @@ def curves(world):
     """Settings of forces and friction without a name, with knots well inside the travel and its
     speeds."""
     make = world.curve
-    grid = np.array([[0.2, -0.1, 0.3], [0.0, 0.4, -0.2]])
     return [
         {make("elbow", "position:elbow", (-0.4, -0.3, 0.1)): (0.3, -0.3, 0.2)},
         {make("elbow", "velocity:swing", (-0.5, 0.0, 0.3)): (0.3, 0.0, -0.2)},
@@ -56,14 +54,6 @@ def curves(world):
         {make("elbow", "position:elbow", (-0.4, 0.1), "velocity:elbow"): (-0.1, -0.2)},
         {make("elbow", "position:elbow", (0.0, 0.1), "speed:swing", wave=True): (0.3, 0.2)},
         {make("elbow", "time", (0.0, 0.05), wave=True): (0.3, 0.2)},
-        {
-            surface(
-                world.model,
-                "elbow",
-                ("position:elbow", "velocity:swing"),
-                ((-0.35, -0.2), (-0.6, 0, 0.4)),
-            ): tuple(grid.ravel())
-        },
         {friction_curve(world.model, "elbow", (-0.4, -0.3, 0.1)): (0.3, 0.0, 0.2)},
     ]
 
@@ -190,7 +180,7 @@ def test_the_script_stands_alone(tmp_path):
     setting = {world.candidate("load_friction", "j"): (0.2, 0.3, 1.0)}
     xml, written = world.corrected_xml(setting)
     text = corrected_py(python_parts(world.model, setting, written), ["j"])
-    for absent in ("diagnosis", "gain_fade", "def surface", "def asked"):
+    for absent in ("diagnosis", "gain_fade", "def asked"):
         assert absent not in text
     assert max(map(len, text.splitlines())) <= 100
     (tmp_path / "corrected.xml").write_text(xml)
