@@ -100,8 +100,8 @@ def test_a_force_without_a_name_is_about_as_large_as_what_is_missing():
     asked = np.sqrt(np.mean(run.ctrl[:, 0] ** 2))
     assert plausible(times, usual).scale == pytest.approx([0.06 / asked] * 2)
     grows = world.curve("pivot", "position:pivot", (0.0, 1.0), "speed:pivot")
-    speed = np.sqrt(np.mean(run.qvel[:, 0] ** 2))
-    assert plausible(grows, usual).scale == pytest.approx([0.06 / speed] * 2, rel=1e-6)
+    usual.speed = np.array([0.25])
+    assert plausible(grows, usual).scale == pytest.approx([0.06 / 0.25] * 2)
     assert np.isinf(plausible(curve, Usual(world, [run], np.array([0.5]))).scale).all()
 
 
