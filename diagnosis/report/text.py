@@ -93,7 +93,7 @@ def estimate(parameter: dict) -> str:
 
 def _force_words(finding: dict) -> str:
     """What a force without a name depends on, or how it repeats, as the middle of a sentence."""
-    if (finding.get("curve") or {}).get("wave"):
+    if (finding.get("curve") or {}).get("wave") and "time" in (finding.get("depends_on") or ()):
         # its parameters are a sine's values a quarter of a period apart
         one, other = finding["parameters"]
         hertz = 0.25 / (other["at"] - one["at"])

@@ -484,6 +484,11 @@ def test_a_wave_in_words():
         "joint elbow: a force that the catalogue has no name for, "
         "repeating 2.00 times a second with an amplitude of 0.500 N·m"
     )
+    wave["depends_on"] = ["position:elbow", "velocity:elbow"]
+    assert wording.finding_words(wave) == (
+        "joint elbow: a force that the catalogue has no name for, depending on the position of "
+        "elbow and the velocity of elbow"
+    )
 
 
 def test_error_in_words():
