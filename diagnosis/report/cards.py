@@ -6,7 +6,6 @@ curves = unknown_curves(diagnosis)       # those of findings without a name
 
 import math
 
-import mujoco
 import numpy as np
 
 from diagnosis.recordings import inverse_dynamics
@@ -124,8 +123,12 @@ def _sampled(diagnosis, candidate, values):
     effect, period = candidate.effect, None
     if effect.wave:
         period = 4 * (effect.knots[1] - effect.knots[0])
-        course, unit = _course(diagnosis, effect.variable)
-        low, high = np.nanmin(course), np.nanmax(course)
+        model, runs = diagnosis.world.model, [*diagnosis.train, *diagnosis.held_out]
+        course_of = lambda r: inverse_dynamics.course_of(
+            model, effect.variable, r.time, r.qpos, r.qvel, r.ctrl
+        )
+        courses, _, (unit, *_) = zip(*map(course_of, runs))
+        low, high = np.nanmin(np.concatenate(courses)), np.nanmax(np.concatenate(courses))
         x = np.arange(low, high + period / PER_PERIOD, period / PER_PERIOD)
         period = f"{text.number(period)} {unit}"
     else:
@@ -139,16 +142,6 @@ def _sampled(diagnosis, candidate, values):
         "force": effect.at(x, np.tile(values, (len(x), 1))),
         "unit": candidate.parameters[0].unit,
     }
-
-
-def _course(diagnosis, variable):
-    """(what was recorded of time, or of a joint's position (n,), its unit)."""
-    runs, (kind, _, name) = [*diagnosis.train, *diagnosis.held_out], variable.partition(":")
-    if kind == "time":
-        return np.concatenate([r.time for r in runs]), "s"
-    joint = diagnosis.world.model.joint(name)
-    unit = "m" if joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
-    return np.concatenate([r.qpos[:, joint.qposadr[0]] for r in runs]), unit
 
 
 def _curve(curve, parameters):
