@@ -17,6 +17,7 @@ from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
+from diagnosis.selection.adequacy import lacking
 from diagnosis.selection.conditions import concentrated
 from diagnosis.selection.criterion import PRICE, complexity, paired
 from diagnosis.selection.event import Event
@@ -25,6 +26,7 @@ from diagnosis.selection.identification import (
     Found,
     Identification,
     changing,
+    physics,
     without,
 )
 from diagnosis.selection.judge import Fitted
@@ -41,7 +43,8 @@ STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 class Outcome:
     """All that the report is made of: found (Found), fitted (Fitted set), trajectory (Trajectory
     under it), others {Candidate: [(other, values)]}, p_values, strains {Candidate: words}, left
-    ([Dependence] under the final set), dependences (under the nominal model), handed (Handed),
+    ([Dependence] under the final set), dependences (under the nominal model), lacks ([Comparison]
+    of each channel with a perfect simulator, where nothing has a name), handed (Handed),
     train_check and held_check (Check)."""
 
     found: Found
@@ -52,6 +55,7 @@ class Outcome:
     strains: dict
     left: list
     dependences: list
+    lacks: list = ()
     handed: Handed = None
     train_check: Check = None
     held_check: Check = None
@@ -92,6 +96,8 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     outcome.earned = bool(outcome.fitted.setting or outcome.event)
     say(0.85, "checking what is handed over")
     _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
+    if not physics(outcome.fitted.setting):
+        _nameless(search, outcome)
     say(0.95, "held-out error")
     return findings.assemble(world, train, held_out, outcome)
 
@@ -169,6 +175,18 @@ def _curve_there(search, found, fitted, where, log):
     values = beside.setting[rest.candidate]
     told = rest.candidate, values, where.recording, where.time, where.p_value
     return Event(*told, low=values, high=values, removed=where.removed(fitted, beside))
+
+
+def _nameless(search, outcome):
+    """Fill in what a perfect simulator would remove of what is left, in finer steps, and what the
+    located force follows where most of it is left."""
+    outcome.lacks = lacking(search.finer(outcome.found.judge, outcome.fitted))
+    where = concentrated(outcome.fitted)
+    if where:
+        rows = where.rows(search.train)
+        outcome.left = unmodelled_force.dependences(
+            search.world, outcome.trajectory, search.train, most=None, rows=rows
+        )
 
 
 def _beside(search, judge, fitted, rest, price):

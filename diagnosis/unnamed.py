@@ -14,6 +14,7 @@ from diagnosis.effects.base import HINGE, JOINT_TRANSMISSIONS, SLIDE, is_numeric
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND, PRICE
+from diagnosis.selection.identification import LEVEL
 from diagnosis.selection.plausibility import at_limit, plausible
 from diagnosis.selection.unmodelled_force import ABOVE
 
@@ -70,13 +71,21 @@ def _channel(outcome, model, joint):
     return [model.jnt_dofadr[joint] in dofs for dofs in channels].index(True)
 
 
-def missing_most(world, outcome):
-    """The joint whose missing force stands out most of those in which a perfect model would be
-    worth the price of a force without a name; None where there is none."""
-    model, room = world.model, outcome.fitted.evidence.room()
-    wide = room > PRICE * UNNAMED
-    joints = [j for j in range(model.njnt) if wide[_channel(outcome, model, j)]]
-    return _standing_out(world, outcome, joints)
+def missing_most(world, outcome, something):
+    """The hinge or slide in which a perfect simulator would gain most, of those in which that is
+    worth the price of a force without a name, and no chance; None where there is none. Where
+    held-out recordings do not show that something is missing, the located force there has to follow
+    anything by more than it scatters: noise that is not white moves start states as well."""
+    model, lacks = world.model, outcome.lacks
+    above = {d.joint: d.above for d in reversed(outcome.left)}  # the best first
+    gains = {}
+    for j in range(model.njnt):
+        name, lack = model.joint(j).name, lacks[_channel(outcome, model, j)]
+        worth = lack.gain > PRICE * UNNAMED and lack.p_value < LEVEL / len(lacks)
+        if model.jnt_type[j] in (HINGE, SLIDE) and worth:
+            if something or above.get(name, 0.0) > ABOVE:
+                gains[name] = lack.gain
+    return max(gains, key=gains.get, default=None)
 
 
 def depends_on(model, candidate):
@@ -97,7 +106,7 @@ def depends_on(model, candidate):
 def unknown(joint, outcome, on=()):
     """The finding of a force at a joint, without a name and without a curve, that depends on some
     variables and on what the force follows best that is left there."""
-    told = next((d.variables for d in outcome.left if d.joint == joint), ())
+    told = [variable for d in outcome.left if d.joint == joint for variable in d.variables]
     return {
         "effect": "unknown",
         "place": {"kind": "joint", "name": joint},
@@ -153,7 +162,7 @@ def _unearned(world, outcome, shares, something):
         joint, _ = main_joint(world, outcome, candidate, shares)
         if joint:
             return joint, depends_on(world.model, candidate)
-    return (missing_most(world, outcome) if something else None), ()
+    return missing_most(world, outcome, something), ()
 
 
 def led(world, outcome, findings, something):

@@ -6,6 +6,8 @@ residual = ahead.residual([{}, {friction: (0.1,)}])      # (settings, W, T, nv),
 predicted
 """
 
+from copy import copy
+
 import numpy as np
 
 from diagnosis.effects.base import runge_kutta
@@ -112,6 +114,18 @@ class Ahead:
         than the travel. refine: the time step is divided by it."""
         qvel = np.concatenate([self._velocities(s, refine) for s in settings])
         return self._simulated(self.world, settings, qvel, refine)
+
+    def drawn(self, setting, residual, louder, rng):
+        """A residual (W, T, nv) as a perfect simulator would leave it: of readings with noise,
+        start states as far off as the smoother leaves them, both so many times louder (nv,).
+        residual: what the setting leaves."""
+        off, nv = self.spread * rng.standard_normal(self.spread.shape), self.model.nv
+        other = copy(self)
+        other.qpos = windowing.integrate(self.model, self.qpos, louder * off[:, :nv])
+        other.qvel = self.qvel + louder * off[:, nv:]
+        noise = louder * np.where(np.isfinite(self.noise), self.noise, 0.0)
+        gap = residual - other.residual([setting])[0] + noise * rng.standard_normal(residual.shape)
+        return np.where(self.known, gap, 0.0)
 
     def rough(self, settings):
         """As of residual(), for columns, which are differences of two of these: what a coarse step

@@ -257,11 +257,13 @@ class Evidence:
         groups = len(each) * shares.sum(1)
         return Score(float(groups.mean()), groups, each.sum(1), amounts, self.independent)
 
-    def room(self):
-        """Nats of the loss (channels,) that a prediction without errors but the noise would remove
-        from the reference."""
-        _, shares = self._logs(np.minimum(self.noise**2, self.reference))
-        return -shares.reshape(len(shares), self.channels, -1).sum((0, 2))
+    def each_channel(self, square):
+        """[Score] of each channel alone, of mean squared errors (G, cells)."""
+        split = lambda x: x.reshape(len(x), self.channels, -1).sum(2).T
+        logs, groups = (split(x) for x in self._logs(square))
+        groups = len(square) * groups
+        pairs = zip(groups, logs)
+        return [Score(float(g.mean()), g, x, np.zeros(0), self.independent) for g, x in pairs]
 
     def different(self):
         """How many columns are different: the effective number of independent tests, of their

@@ -10,7 +10,7 @@ from arm import ARM, run
 from diagnosis import unnamed
 from diagnosis.estimation.smoother import Trajectory
 from diagnosis.recordings.recording import Recording
-from diagnosis.selection.criterion import PRICE
+from diagnosis.selection.criterion import PRICE, Comparison
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.simulator import World
 
@@ -34,10 +34,10 @@ def smoothed(elbow, shoulder=0.0, scatter=0.1):
     return Trajectory(none, none, force, none, none, sd, {}, free, none)
 
 
-def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1), gone=()):
-    """errors: of the elbow, before and after, in ten noises; the shoulder errs by none. room: nats
-    that a perfect model would remove in the shoulder and in the elbow. gone: what was not handed
-    over."""
+def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, gains=(1, 1), gone=()):
+    """errors: of the elbow, before and after, in ten noises; the shoulder errs by none. gains:
+    nats that a perfect simulator would remove in the shoulder and in the elbow. gone: what was not
+    handed over."""
     dependences = [SimpleNamespace(joint=j, variables=v, size=1.0, above=2.0) for j, v in depends]
     before, after = (np.array([[1.0, 1.0, 100 * e**2, 100 * e**2]]) for e in errors)
     evidence = SimpleNamespace(
@@ -46,7 +46,6 @@ def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)
         channels=2,
         reference=before,
         squares=lambda columns, amounts: after,
-        room=lambda: np.array(room),
     )
     ahead = SimpleNamespace(channels=[np.array([0]), np.array([1])])
     setting = {FRICTION: (friction,), STIFFNESS: (0.1,), MASS: (0.3,)}
@@ -55,7 +54,12 @@ def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, room=(1, 1)
     found = SimpleNamespace(first=trajectory, usual=USUAL, fitted=fitted)
     handed = SimpleNamespace(gone=list(gone))
     return SimpleNamespace(
-        found=found, fitted=fitted, left=dependences, dependences=[], handed=handed
+        found=found,
+        fitted=fitted,
+        left=dependences,
+        dependences=[],
+        handed=handed,
+        lacks=[Comparison(gain, 1e-9) for gain in gains],
     )
 
 
@@ -158,31 +162,49 @@ def test_of_two_unknown_forces_at_a_joint_the_more_important_one_is_told():
     assert only["evidence"]["held_out_error_removed"] == 0.4
 
 
-def test_where_nothing_has_a_name_the_joint_that_stands_out_is_told():
-    both = outcome(smoothed(0.3, shoulder=0.9), depends=DEPENDS)
+def test_where_nothing_has_a_name_the_joint_that_lacks_most_is_told():
+    both = outcome(smoothed(0.3), depends=DEPENDS, gains=(1.0, 0.9))
     [only] = unnamed.led(WORLD, both, [], True)
     assert (only["effect"], only["place"]["name"]) == ("unknown", "shoulder")
     assert only["depends_on"] == ["time"] and only["written_as"] == "none"
-    assert unnamed.led(WORLD, both, [], False) == []
 
 
 def test_a_finer_time_step_is_no_name():
     finer = {"effect": "time_step", "place": {"kind": "world", "name": "world"}}
-    loud = outcome(smoothed(0.3, shoulder=0.9))
+    loud = outcome(smoothed(0.3), gains=(1.0, 0.9))
     kept, force = unnamed.led(WORLD, loud, [(None, finer)], True)
     assert kept == finer and force["place"]["name"] == "shoulder"
     assert unnamed.led(WORLD, loud, [(None, finer)], False) == [finer]
 
 
-def test_a_force_without_a_name_is_told_only_where_a_perfect_model_is_worth_its_price():
+def places(given, something):
+    return [f["place"]["name"] for f in unnamed.led(WORLD, given, [], something)]
+
+
+def test_a_force_without_a_name_is_told_only_where_a_perfect_simulator_is_worth_its_price():
     price = PRICE * unnamed.UNNAMED
-    places = lambda room: [
-        f["place"]["name"]
-        for f in unnamed.led(WORLD, outcome(smoothed(0.3, shoulder=0.9), room=room), [], True)
-    ]
-    assert places((0.9 * price, 0.9 * price)) == []
-    assert places((1.1 * price, 1.1 * price)) == ["shoulder"]  # what stands out most
-    assert places((0.9 * price, 1.1 * price)) == ["elbow"]
+    told = lambda *gains: places(outcome(smoothed(0.3), gains=gains), True)
+    assert told(0.9 * price, 0.9 * price) == []
+    assert told(1.2 * price, 1.1 * price) == ["shoulder"]
+    assert told(0.9 * price, 1.1 * price) == ["elbow"]
+    chance = outcome(smoothed(0.3))
+    chance.lacks = [Comparison(1.0, p) for p in (0.03, 0.02)]  # two joints were asked
+    assert places(chance, True) == ["elbow"]
+
+
+def test_what_held_out_recordings_do_not_show_the_located_force_has_to():
+    quiet = outcome(smoothed(0.3), depends=DEPENDS, gains=(1.0, 0.9))
+    assert places(quiet, False) == ["shoulder"]  # twice as much as it scatters
+    quiet.left[1].above = 0.9
+    assert places(quiet, False) == ["elbow"]
+    assert places(outcome(smoothed(0.3)), False) == []  # it follows nothing
+
+
+def test_an_unknown_force_names_the_variables_that_it_follows_best():
+    some = [("elbow", ("time",)), ("shoulder", ("position:elbow",)), ("elbow", ("time", "x"))]
+    some += [("elbow", ("y", "z"))]
+    [only] = unnamed.led(WORLD, outcome(smoothed(0.3), depends=some, gains=(0, 1)), [], True)
+    assert only["depends_on"] == ["time", "x", "y"]
 
 
 def test_what_kept_back_recordings_spoke_against_is_an_unknown_force_at_its_joint():

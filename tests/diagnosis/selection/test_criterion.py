@@ -293,16 +293,17 @@ def test_a_fit_is_the_best_of_several_minima():
     assert free(evidence, (0,)).amounts == pytest.approx([least], abs=0.01)
 
 
-def test_room_is_the_loss_that_a_perfect_model_removes():
-    """Of two channels, one with an error of ten noises and one within the noise."""
+def test_each_channel_has_its_part_of_the_loss():
+    """Of two channels, one with an error of ten noises, which a column removes."""
     rng, ahead = np.random.default_rng(4), scene(channels=2, bands=2, noise=0.1)
     noise = 0.1 * clustered(rng, ahead, share=0.0)
     column = clustered(rng, ahead, share=0.0) * np.array([1.0, 0.0])
     evidence = evidence_of(ahead, column + noise, column[..., None])
-    removed = -free(evidence, (0,)).loss
-    room = evidence.room()
-    assert removed == pytest.approx(room.sum(), rel=0.02) and room[0] > 2
-    assert abs(room[1]) < 1e-9
+    square = evidence.squares((0,), np.ones(1))
+    first, second = evidence.each_channel(square)
+    assert first.loss + second.loss == pytest.approx(evidence.at((0,), np.ones(1)).loss)
+    assert first.loss < -2 and abs(second.loss) < 1e-9
+    assert paired(evidence.each_channel(evidence.square)[0], first).p_value < 1e-3
 
 
 def test_a_prior_weighs_as_much_beside_joints_that_lack_nothing():
