@@ -145,7 +145,9 @@ def _named_there(search, found, fitted, where, log):
     there = Identification(world, parts, log=log)
     inside = there.run(fitted.setting)
     best, others = _classes(there, inside, inside.fitted, log, there.candidates)
-    new = [c for c in best.setting if c not in fitted.setting and not c.effect.numerical]
+    # what has states of its own cannot come and go
+    steady = lambda c: c in fitted.setting or c.effect.numerical or world.adds_states(c)
+    new = [c for c in best.setting if not steady(c)]
     if not new:
         return None
     most = max(new, key=lambda c: without(best, c).loss)

@@ -220,12 +220,12 @@ class Identification:
                 break
             options = beam.columns.options
             added = [options[k].candidate for k in node.options[len(start.options) :]]
-            # a finer step is no other explanation, and curves of one joint's force are one
+            # a finer step is no other explanation
             added = [c for c in added if not c.effect.numerical] or added
             chance = not self.no_chance(paired(start.score, node.score), len(added))
             if node.loss >= start.loss and chance:
                 continue
-            names = {c.place if isinstance(c.effect, Unknown) else c for c in added}
+            names = set(map(one, added))
             same = [abs(node.score.groups - c.score.groups).max() < LEAST for c in chosen]
             if not any(same) and not any(names >= better for better in seen):
                 seen.append(names)
@@ -233,7 +233,7 @@ class Identification:
         alone = {}
         for node in nodes:
             if len(node.options) == len(start.options) + 1:
-                alone.setdefault(beam.columns.options[node.options[-1]].candidate, node)
+                alone.setdefault(one(beam.columns.options[node.options[-1]].candidate), node)
         return chosen + [n for n in list(alone.values())[:ALONE] if n not in chosen]
 
     def _choose(self, judged, now):
@@ -355,6 +355,11 @@ def changing(judge, fitted):
     same = [c for c, v in fitted.setting.items() if np.allclose(v, c.nominal, rtol=1e-6, atol=0)]
     rest = {c: v for c, v in fitted.setting.items() if c not in same}
     return judge.fit(rest, steps=0) if same else fitted
+
+
+def one(candidate):
+    """What a candidate counts as among others: curves of one joint's force are one."""
+    return candidate.place if isinstance(candidate.effect, Unknown) else candidate
 
 
 def physics(candidates):

@@ -126,7 +126,10 @@ def _full(candidate, base, rows, prior):
     """The Start of a group of whole values (p, k)."""
     finite, together = np.isfinite(base).all(), len(rows)
     start = base if finite else np.zeros_like(base)
-    low, high = FULL if together == 1 else (-FULL[1], FULL[1])
+    low, high = FULL
+    if together > 1:  # waves act in proportion, as far as is plausible
+        high = prior.high[0] / rows[0, 0]
+        low = -high
     if not finite:
         low, high = 1.0, 1.0  # a limit that there was not: no share of it means anything
     bounds = np.full(together, low), np.full(together, high)

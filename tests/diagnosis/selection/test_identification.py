@@ -178,6 +178,16 @@ def test_finalists_are_worth_their_price_or_no_chance_and_predict_differently(se
     assert finalists[3:] == [same, luck]  # simple sets are judged whatever columns tell of them
 
 
+def test_single_curves_of_a_joint_take_one_place_among_those_that_are_judged(search):
+    """Each alone is worth less than its price, and by chance: simple sets are judged all the same."""
+    noise, chance = 1e-3 * np.arange(16), np.where(np.arange(16) == 3, -0.5, 0.0)
+    curves = [search.world.curve("elbow", "time", (0.0, 1.0 + k)) for k in range(5)]
+    effects = [SimpleNamespace(candidate=c) for c in (*curves, search.world.candidates[0])]
+    beam = SimpleNamespace(columns=SimpleNamespace(options=effects))
+    nodes = [node(noise + chance, 0.2 + 0.01 * k, k) for k in range(6)]
+    assert search._finalists(beam, node(noise, 0.0), nodes) == [nodes[0], nodes[5]]
+
+
 def test_a_finer_step_makes_no_other_explanation_of_a_set(search):
     noise, step = 1e-3 * np.arange(16), search.world.candidate("time_step", "world")
     named = [*search.world.candidates[:4], step]

@@ -58,6 +58,8 @@ def test_a_friction_map_begins_at_the_wave_of_the_located_force(machine):
     nearest = TURNS[np.argmin(abs(TURNS / travel - waves))] / travel
     assert any(abs(n - nearest) < 1e-3 for n in begun) and len(begun) == 3
     assert all(start.merges and len(start.directions) == 3 for start in starts)
+    reach = [start.high[0] * start.directions[0, 0] for start in starts]  # all that is plausible
+    assert reach == pytest.approx([plausible(friction, usual).high[0]] * len(starts))
 
 
 def test_a_drives_bias_is_as_plausible_as_the_springs_offset_that_it_equals(machine):

@@ -429,3 +429,22 @@ def test_bad_models_say_so_in_one_line(tmp_path):
             World.from_env(env_id)
         assert len(str(error.value).splitlines()) == 1
     assert World.from_env("Hopper-v5").candidate("mass", "torso").nominal[0] > 3
+
+
+@pytest.mark.parametrize("kind", ["motors", "servos"])
+def test_what_acts_under_a_condition_that_never_holds_changes_nothing(kind):
+    """Effects that add a motor or a tendon neither; what adds states cannot come and go."""
+    world, _ = arm(kind)
+    recording = record(world)
+    [plain] = simulate(world, [{}], recording)
+    never = {"recording": None, "time": [100.0, 101.0]}
+    first = {}
+    for candidate in world.candidates:
+        first.setdefault(candidate.effect.name, candidate)
+    for name, candidate in first.items():
+        effect, timed = candidate.effect, world.localised(candidate, never)
+        apart = effect.numerical or effect.overrides("measure") or world.adds_states(candidate)
+        if name not in SIZES or apart:
+            continue
+        [moved] = simulate(world, [{timed: SIZES[name]}], recording)
+        np.testing.assert_allclose(moved, plain, atol=2e-4, err_msg=name)
