@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from diagnosis.trials.page import parse, rates
+from diagnosis.trials.table import read_rows
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results/README.md"]
 PAGES += sorted((ROOT / "docs").glob("*.md"))
@@ -61,6 +64,31 @@ def test_the_readme_is_short_and_has_its_test_command():
     assert len(lines) <= 150
     marker = lines.index("<!-- test -->")
     assert lines[marker + 1] == "```bash" and "pytest" in lines[marker + 2]
+
+
+SEALED = {
+    "something hidden: all right, by strict rules": "strict success, something hidden",
+    "one effect above three times the noise: named": "one effect > 3 × noise: named, "
+    "or in a class of ≤ 3",
+    "nothing hidden: a false claim": "nothing hidden: a false claim",
+    "any trial: a false claim": "any trial: a false claim",
+    "any trial: a prediction worse than the nominal model's": "held-out error above the nominal "
+    "model's",
+}  # what the README says, and what a table is asked
+
+
+def test_the_readmes_sealed_numbers_are_those_of_the_table_that_it_links():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    table, commit = re.search(r"\[(proof_\w+\.csv)\]\(results/\S+, (\w+) \|", text).groups()
+    rows = read_rows(ROOT / "results" / table)
+    assert {row["version"][:7] for row in rows} == {commit}
+    asked = {what: rate for _, what, rate in rates([parse(row) for row in rows])}
+    lines = re.findall(r"(?m)^\| sealed, (.+?) \| (\d+) of (\d+) \| (\d+)–(\d+) % \|", text)
+    assert [what for what, *_ in lines] == list(SEALED)
+    for what, *told in lines:
+        rate = asked[SEALED[what]]
+        percent = [round(100 * end) for end in rate.interval]
+        assert [int(n) for n in told] == [rate.hits, rate.trials, *percent], what
 
 
 def test_every_table_says_what_made_it():

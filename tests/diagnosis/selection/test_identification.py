@@ -179,7 +179,7 @@ def test_finalists_are_worth_their_price_or_no_chance_and_predict_differently(se
 
 
 def test_single_curves_of_a_joint_take_one_place_among_those_that_are_judged(search):
-    """Each alone is worth less than its price, and by chance: simple sets are judged all the same."""
+    """Each alone is worth less than its price: simple sets are judged all the same."""
     noise, chance = 1e-3 * np.arange(16), np.where(np.arange(16) == 3, -0.5, 0.0)
     curves = [search.world.curve("elbow", "time", (0.0, 1.0 + k)) for k in range(5)]
     effects = [SimpleNamespace(candidate=c) for c in (*curves, search.world.candidates[0])]
