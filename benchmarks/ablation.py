@@ -56,6 +56,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no curves in the search": {"diagnosis.selection.identification:CURVES": 0},
     "fewer starts": {"diagnosis.selection.starts:PROBES": 4},
     "one finalist": {"diagnosis.selection.identification:FINALISTS": 1},
+    "what is left may scatter as it likes": {"diagnosis.selection.unmodelled_force:ABOVE": 0.0},
     "not begun elsewhere": {"diagnosis.selection.identification:ELSEWHERE": 0},
     "no single effects beside the finalists": {"diagnosis.selection.identification:ALONE": 0},
     "one horizon": {"diagnosis.estimation.ahead:HORIZONS": (1.0,)},
