@@ -108,18 +108,19 @@ def _checked(search, found, fitted, others, log):
     dependences = unmodelled_force.dependences(world, found.first, train, most=None)
     trajectory = found.trajectory
     left = unmodelled_force.dependences(world, trajectory, train, most=None)
+    finer = None  # what finer steps explain as well is no force
     for rest in unmodelled_force.each_joint(left)[:2]:
+        finer = finer or search.finer(judge, fitted)
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         # where no name is found, all that is told are a joint and a variable
         units = complexity([rest.candidate]) if mine else UNNAMED
-        # what finer steps explain as well is no force
-        beside = _beside(search, judge, search.finer(judge, fitted), rest, PRICE * units)
+        beside = _beside(search, judge, finer, rest, PRICE * units)
         if not beside:
             continue
         log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
         size = _force(found, trajectory, world, rest.joint)
         if not mine or rest.size > INSTEAD * size:
-            fitted = search.pruned(judge, beside, judge.fit({})) if mine else beside
+            fitted, finer = search.pruned(judge, beside, judge.fit({})) if mine else beside, None
         if rest.candidate in fitted.setting:
             break
     return Outcome(found, fitted, trajectory, others, {}, {}, left, dependences)

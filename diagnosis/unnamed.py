@@ -76,15 +76,14 @@ def missing_most(world, outcome, something):
     worth the price of a force without a name, and no chance; None where there is none. Where
     held-out recordings do not show that something is missing, the located force there has to follow
     anything by more than it scatters: noise that is not white moves start states as well."""
-    model, lacks = world.model, outcome.lacks
-    above = {d.joint: d.above for d in reversed(outcome.left)}  # the best first
+    model, level = world.model, LEVEL / len(outcome.lacks)
+    loud = {d.joint for d in outcome.left if d.above > ABOVE}
     gains = {}
-    for j in range(model.njnt):
-        name, lack = model.joint(j).name, lacks[_channel(outcome, model, j)]
-        worth = lack.gain > PRICE * UNNAMED and lack.p_value < LEVEL / len(lacks)
-        if model.jnt_type[j] in (HINGE, SLIDE) and worth:
-            if something or above.get(name, 0.0) > ABOVE:
-                gains[name] = lack.gain
+    for j in np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))):
+        name, lack = model.joint(j).name, outcome.lacks[_channel(outcome, model, j)]
+        worth = lack.gain > PRICE * UNNAMED and lack.p_value < level
+        if worth and (something or name in loud):
+            gains[name] = lack.gain
     return max(gains, key=gains.get, default=None)
 
 

@@ -333,7 +333,7 @@ class Cogging(JointEffect):
         return f"cogging:{model.joint(i).name}"
 
     def build(self, spec, model, i):
-        self.write(spec, model, i, (0.0, 1.0, 0.0))
+        self.write(spec, model, i, (0.0, 1.0, 0.0))  # no force while it is off
 
     def edit(self, model, i, values):
         model.actuator_biasprm[model.actuator(self._motor(model, i)).id, :3] = values

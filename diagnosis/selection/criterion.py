@@ -253,17 +253,17 @@ class Evidence:
 
     def _scored(self, square, amounts):
         """The Score of mean squared errors (G, cells)."""
-        each, shares = self._logs(square)
-        groups = len(each) * shares.sum(1)
-        return Score(float(groups.mean()), groups, each.sum(1), amounts, self.independent)
+        return self._summed(*self._logs(square), amounts)
 
     def each_channel(self, square):
         """[Score] of each channel alone, of mean squared errors (G, cells)."""
-        split = lambda x: x.reshape(len(x), self.channels, -1).sum(2).T
-        logs, groups = (split(x) for x in self._logs(square))
-        groups = len(square) * groups
-        pairs = zip(groups, logs)
-        return [Score(float(g.mean()), g, x, np.zeros(0), self.independent) for g, x in pairs]
+        parts = (np.split(x, self.channels, axis=1) for x in self._logs(square))
+        return [self._summed(*part, np.zeros(0)) for part in zip(*parts)]
+
+    def _summed(self, each, shares, amounts):
+        """The Score of some cells, of what _logs() tells of them (G, some)."""
+        groups = len(each) * shares.sum(1)
+        return Score(float(groups.mean()), groups, each.sum(1), amounts, self.independent)
 
     def different(self):
         """How many columns are different: the effective number of independent tests, of their

@@ -221,7 +221,7 @@ class Identification:
             options = beam.columns.options
             added = [options[k].candidate for k in node.options[len(start.options) :]]
             # a finer step is no other explanation
-            added = [c for c in added if not c.effect.numerical] or added
+            added = physics(added) or added
             chance = not self.no_chance(paired(start.score, node.score), len(added))
             if node.loss >= start.loss and chance:
                 continue
