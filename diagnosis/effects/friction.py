@@ -32,7 +32,7 @@ FALLS = 0.05
 SELF_LOCKING = 2.0  # share of the load beyond which no drive would turn
 # radians that a friction map's wave turns over the travel, to try first: so close to each other
 # that one of them stays in step with the true wave from end to end
-TURNS = np.arange(3.25, 40.0, 3.0)
+TURNS = np.arange(6.5, 40.0, 3.0)
 
 
 @catalogue
@@ -218,9 +218,9 @@ class FrictionMap(DryFriction):
         )
 
     def suited(self, parameters, model, i, recordings):
-        """At least half a wave within the recorded travel."""
+        """At least one wave within the recorded travel: less may be of any shape."""
         level, contrast, waves, phase = parameters
-        least = np.pi / self._travelled(model, i, recordings)
+        least = 2 * np.pi / self._travelled(model, i, recordings)
         return level, contrast, replace(waves, low=min(max(waves.low, least), waves.high)), phase
 
     def _travelled(self, model, i, recordings):

@@ -122,12 +122,15 @@ class Identification:
     def _elsewhere(self, found):
         """Fitted sets of the first round that leave something else than the best one did, best
         first, where the force that the search left follows anything by more than it scatters: what
-        is taken first may hide what needs another beside it."""
+        is taken first may hide what needs another beside it. Names that predict worse than a curve
+        without a name are nothing to begin with, nor is that."""
         left = dependences(self.world, found.trajectory, self.train, most=1)
         if not left or left[0].above < ABOVE:
             return []
         apart = []
         for f in sorted(self.judged, key=lambda f: f.loss):
+            if any(isinstance(c.effect, Unknown) for c in f.setting):
+                break
             if all(abs(f.left @ other.left) < ALIKE for other in apart):
                 apart.append(f)
         return [f for f in apart[1:] if physics(f.setting) - set(found.fitted.setting)][:ELSEWHERE]

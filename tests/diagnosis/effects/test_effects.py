@@ -387,6 +387,16 @@ def test_stribeck_friction_has_fallen_at_the_speeds_that_are_reached():
     assert all(row[2] <= velocity.high for row in world.probes(candidate, [run]))
 
 
+def test_a_friction_map_turns_once_within_the_travel_at_least():
+    world, _ = arm("motors")
+    candidate = world.candidate("friction_map", "elbow")
+    run = record(world)
+    swept = replace(run, qpos=np.linspace(-1.0, 1.0, T)[:, None] * np.ones(world.model.nq))
+    waves = world.suited(candidate, [swept]).parameters[2]
+    assert 2 * np.pi / waves.low == pytest.approx(0.96 * 2.0, rel=0.01)  # but for rare ends
+    assert min(row[2] for row in world.probes(candidate, [swept])) >= waves.low
+
+
 @given(st.floats(0.01, 30), st.floats(0.01, 30))
 def test_small_steps_are_forces_of_one_size_whatever_the_motion(reach, speed):
     """k·x³ and d·v² at the farthest and fastest row, against the steps of a motion of size one."""

@@ -224,8 +224,9 @@ def leaves(search, names, loss, angle):
     return told
 
 
-def begun_elsewhere(search, monkeypatch, above, ended=("viscous_damping",)):
-    """First effects of the sets from which a search begins again that ended with some."""
+def begun_elsewhere(search, monkeypatch, above, ended=("viscous_damping",), curve=1.0):
+    """First effects of the sets from which a search begins again that ended with some; curve: loss
+    of a set without a name."""
     left = [Dependence("elbow", ("time",), 0.9, 1.0, None, (), above)] if above else []
     monkeypatch.setattr(identification, "dependences", lambda *args, most: left)
     search.judged = [
@@ -233,7 +234,9 @@ def begun_elsewhere(search, monkeypatch, above, ended=("viscous_damping",)):
         leaves(search, ["viscous_damping", "stiffness"], -2.0, 0),
         leaves(search, ["stribeck_friction"], -1.8, 20),  # leaves the same
         leaves(search, ["armature"], -1.5, -60),
+        leaves(search, [], curve, 120),
     ]
+    search.judged[-1].setting = {search.world.curve("elbow", "time", (0.0, 1.0)): ()}
     found = SimpleNamespace(fitted=fitted(search, ended, -2.0), trajectory=None)
     return [next(iter(f.setting)).effect.name for f in search._elsewhere(found)]
 
@@ -247,6 +250,8 @@ def test_a_search_that_leaves_something_begins_again_where_something_else_was_le
     assert begun_elsewhere(search, monkeypatch, None) == []
     ended = begun_elsewhere(search, monkeypatch, 1.5, ("armature", "viscous_damping"))
     assert ended == ["coulomb_friction"]  # not what it ended with
+    for loss, there in ((-1.6, []), (-1.4, ["armature"])):  # of a curve without a name
+        assert begun_elsewhere(search, monkeypatch, 1.5, curve=loss) == there
 
 
 @pytest.mark.parametrize(
