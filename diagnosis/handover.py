@@ -81,11 +81,10 @@ class Check:
         """Smooth the recordings under a setting, for the floor."""
         self.trajectory = self.smoother.locate(setting, passes=2)
 
-    def errors(self, files, windows=None):
-        """(error of Files over all channels in noises, {channel: SI}), or that of windows begun
-        otherwise."""
+    def errors(self, files):
+        """(error of Files over all channels in noises, {channel: SI})."""
         model = self.world.model
-        predicted = files.predicted(model, windows or self.windows)
+        predicted = files.predicted(model, self.windows)
         return windowing.error(model, self.windows, predicted, self.noise)
 
     def smoothed(self, setting):
@@ -110,24 +109,32 @@ class Check:
         return SCATTER * np.sqrt(2 * known[..., self.told].sum()) / max(known.sum(), 1)
 
     def squares(self, files, setting):
-        """Squared errors of the Files of a setting (2,): from start states as recorded, and as they
-        are smoothed under it."""
-        return np.array([self.error(files, w) for w in (self.windows, self.smoothed(setting))]) ** 2
+        """Parts of the squared error of the Files of a setting (2, W), by window: from start states
+        as recorded, and as they are smoothed under it; infinite where they do not run."""
+        return np.array([self._parts(files, w) for w in (self.windows, self.smoothed(setting))])
 
-    def error(self, files, windows=None):
-        """As errors(), of all channels; infinite where they do not run."""
+    def _parts(self, files, windows):
+        """Parts of the squared error (W,) of windows begun otherwise."""
+        model = self.world.model
         try:
-            return self.errors(files, windows)[0]
+            predicted = files.predicted(model, windows)
         except (ScriptError, ValueError, mujoco.FatalError):
-            return np.inf
+            return np.full(len(windows), np.inf)
+        gap, known = windowing.gaps(model, self.windows, predicted)
+        return ((gap / self.noise) ** 2).sum((1, 2)) / max(known.sum(), 1)
+
+    def error(self, files):
+        """As errors(), of all channels; infinite where they do not run."""
+        return float(np.sqrt(self._parts(files, self.windows).sum()))
 
 
 def accepted(world, check, setting, refit=lambda some, out: some, log=lambda what: None, told=None):
     """The Handed of what of a setting kept-back recordings do not speak against: neither all of it
     nor any finding makes a prediction worse by more than noise does, from start states as recorded
-    and as smoothed too. Where these recordings do not show a finding, those that it was found on
-    have decided. refit(setting, out): what is left without one, fitted again; told: the Check of
-    the errors that are told."""
+    and as smoothed too. The window that speaks most against a finding is not counted: one that goes
+    another way decides nothing. Where these recordings do not show a finding, those that it was
+    found on have decided. refit(setting, out): what is left without one, fitted again; told: the
+    Check of the errors that are told."""
     nominal = Files.of(world, {})
     before = check.squares(nominal, {}) if setting else None
     nothing, gone = check.scattered(), []
@@ -137,7 +144,7 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
         rest = {o: {c: v for c, v in setting.items() if c is not o} for o in setting}
         less = {out: Files.of(world, others) for out, others in rest.items()}
         worse = {
-            c: _worse(after, check.squares(less[c], rest[c]))
+            c: _worse(after, check.squares(less[c], rest[c]), uncounted=1)
             for c in setting
             if files.forms[c] in ("mjcf", "python")
         }
@@ -151,7 +158,10 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
     return Handed(setting, nominal, nominal, {}, gone)
 
 
-def _worse(squares, others):
-    """By how much squared errors (kinds,) are larger than others, at least; infinity is worse."""
+def _worse(squares, others, uncounted=0):
+    """By how much squared errors (kinds, W) are larger than others, at least, without the windows
+    in which they are larger by most; infinity is worse."""
     both = np.isinf(squares) & np.isinf(others)
-    return float(np.min(np.where(both, 0.0, squares - np.where(both, 0.0, others))))
+    more = np.sort(np.where(both, 0.0, squares - np.where(both, 0.0, others)), axis=1)
+    counted = more[:, : max(more.shape[1] - uncounted, 1)].sum(1)
+    return float(np.where(more[:, -1] == np.inf, np.inf, counted).min())

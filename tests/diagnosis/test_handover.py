@@ -1,5 +1,7 @@
 """Nothing is handed over that predicts kept-back recordings worse, or that they do not need."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
@@ -79,8 +81,33 @@ def test_what_kept_back_recordings_do_not_show_stays_and_what_they_speak_against
     assert set(accepted(world, check, {**truth, stop: (1e-5,)}).setting) == {*truth, stop}
     some = [{**truth, stop: (x,)} for x in (0.0, 0.02)]
     squares = [check.squares(Files.of(world, s), s) for s in some]
-    assert (squares[1] > squares[0] + check.scattered()).all()
+    assert (squares[1].sum(1) > squares[0].sum(1) + check.scattered()).all()
     assert set(accepted(world, check, {**truth, stop: (0.02,)}).setting) == set(truth)
+
+
+@pytest.mark.parametrize(
+    "harm, kept",
+    [
+        ([9.0, -0.1, -0.1], True),  # one window that goes another way
+        ([9.0, 0.1, 0.1], False),
+        ([5.0, 5.0, -1.0], False),
+        ([9.0], False),  # all that there is
+        ([np.inf, -0.1, -0.1], False),
+    ],
+)
+def test_one_window_decides_nothing_about_a_finding(kept_back, harm, kept):
+    world = kept_back[0]
+    some = [world.candidate(*c) for c in (("viscous_damping", "pivot"), ("bias", "drive"))]
+    harm = np.array([harm, harm])
+    none = np.zeros(harm.shape)
+
+    def squares(files, setting):
+        """Of the first of two findings the second one makes worse by the harm."""
+        return 30.0 - 20 * (some[0] in setting) + (harm if some[1] in setting else none)
+
+    check = SimpleNamespace(squares=squares, scattered=lambda: 0.01, error=lambda files: 1.0)
+    handed = accepted(world, check, {some[0]: (0.1,), some[1]: (0.02,)})
+    assert set(handed.setting) == set(some if kept else some[:1])
 
 
 def test_noise_makes_predictions_better_or_worse_by_its_mean_square():
