@@ -108,18 +108,16 @@ class Starts:
 
     def _applied(self, candidate, values, rows):
         """Generalized forces (n, nv) of actuators and joints with a candidate, dry friction
-        included, in rows (n,) of the trajectory."""
-        world, t = self.world, self.trajectory
-        structure = [candidate] if candidate.effect.overrides("build") else []
+        included, in rows (n,) of the trajectory, but for what is the same at all values."""
+        world, t, effect = self.world, self.trajectory, candidate.effect
+        if effect.overrides("limit"):
+            i = effect.id(world.model, candidate.place.name)
+            most = effect.limit([world.model], i, np.array([values], float))
+            return -t.direction()[rows] * most(t.qpos[rows], t.qvel[rows], None, None, None)
+        structure = [candidate] if effect.overrides("build") else []
         engine = world.engine(frozenset(structure)).working
         model = engine.edited([(candidate, tuple(values))], world.model.opt.timestep)
-        force = applied(model, t.qpos[rows], t.qvel[rows], engine)
-        if candidate.effect.overrides("limit"):
-            i = candidate.effect.id(world.model, candidate.place.name)
-            limit = candidate.effect.limit([world.model], i, np.array([values], float))
-            most = limit(t.qpos[rows], t.qvel[rows], None, None, None)
-            force = force - t.direction()[rows] * most
-        return force
+        return applied(model, t.qpos[rows], t.qvel[rows], engine)
 
 
 def _full(candidate, base, rows, prior):
