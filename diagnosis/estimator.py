@@ -7,6 +7,7 @@ Recordings that were kept back decide what is handed over, after everything is c
 held-out ones are only predicted.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,12 +184,14 @@ def _curve_there(search, found, fitted, where, log):
 def _nameless(search, outcome):
     """Fill in what a perfect simulator would remove of what is left, in finer steps, and what the
     located force follows where most of it is left."""
-    outcome.lacks = lacking(search.finer(outcome.found.judge, outcome.fitted))
-    where = concentrated(outcome.fitted)
-    if where:
-        rows = where.rows(search.train)
+    finer = search.finer(outcome.found.judge, outcome.fitted)
+    outcome.lacks, where = lacking(finer), concentrated(outcome.fitted)
+    trajectory, rows = outcome.trajectory, where.rows(search.train) if where else True
+    if finer is not outcome.fitted:
+        trajectory = copy(outcome.found.smoother).locate(finer.setting, trajectory, passes=1)
+    if where or finer is not outcome.fitted:
         outcome.left = unmodelled_force.dependences(
-            search.world, outcome.trajectory, search.train, most=None, rows=rows
+            search.world, trajectory, search.train, most=None, rows=rows
         )
 
 

@@ -1,10 +1,13 @@
 """Whole diagnoses of a small pendulum that lacks something known, or nothing."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 from plants import DRIVEN_PENDULUM, NOISE, recorded
 
+from diagnosis import estimator
 from diagnosis.estimator import identify
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.simulation.simulator import World
@@ -108,3 +111,27 @@ def test_recordings_without_positions_are_refused():
     run.qpos[:] = np.nan
     with pytest.raises(RecordingError, match="not enough data"):
         identify(world, [run], [])
+
+
+@pytest.mark.parametrize("better", [False, True])
+@pytest.mark.parametrize("where", [False, True])
+def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, better, where):
+    rows = np.array([True, False])
+    condition = SimpleNamespace(rows=lambda train: rows) if where else None
+    monkeypatch.setattr(estimator, "lacking", lambda fitted: fitted.setting)
+    monkeypatch.setattr(estimator, "concentrated", lambda fitted: condition)
+    told = lambda world, trajectory, train, most, rows: (trajectory, rows)
+    monkeypatch.setattr(estimator.unmodelled_force, "dependences", told)
+    locate = lambda setting, near, passes: f"{near} in {setting}"
+    found = SimpleNamespace(judge=None, smoother=SimpleNamespace(locate=locate))
+    fitted = SimpleNamespace(setting="usual steps")
+    finer = SimpleNamespace(setting="finer steps") if better else fitted
+    search = SimpleNamespace(world=None, train=[], finer=lambda judge, given: finer)
+    outcome = SimpleNamespace(found=found, fitted=fitted, trajectory="motion", left="as it was")
+    estimator._nameless(search, outcome)
+    assert outcome.lacks == finer.setting
+    if better or where:
+        motion = "motion in finer steps" if better else "motion"
+        assert outcome.left == (motion, rows if where else True)
+    else:
+        assert outcome.left == "as it was"
