@@ -120,8 +120,7 @@ class Check:
             predicted = files.predicted(model, windows)
         except (ScriptError, ValueError, mujoco.FatalError):
             return np.full(len(windows), np.inf)
-        gap, known = windowing.gaps(model, self.windows, predicted)
-        return ((gap / self.noise) ** 2).sum((1, 2)) / max(known.sum(), 1)
+        return windowing.squares(*windowing.gaps(model, self.windows, predicted), self.noise)
 
     def error(self, files):
         """As errors(), of all channels; infinite where they do not run."""
@@ -159,9 +158,9 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
 
 
 def _worse(squares, others, uncounted=0):
-    """By how much squared errors (kinds, W) are larger than others, at least, without the windows
-    in which they are larger by most; infinity is worse."""
+    """By how much squared errors (kinds, W) are larger than others, at least, but for so many
+    windows in which they are larger by most; infinity is worse."""
     both = np.isinf(squares) & np.isinf(others)
     more = np.sort(np.where(both, 0.0, squares - np.where(both, 0.0, others)), axis=1)
-    counted = more[:, : max(more.shape[1] - uncounted, 1)].sum(1)
-    return float(np.where(more[:, -1] == np.inf, np.inf, counted).min())
+    more[more[:, -1] == np.inf] = np.inf  # other windows make up for none that does not run
+    return float(more[:, : max(more.shape[1] - uncounted, 1)].sum(1).min())

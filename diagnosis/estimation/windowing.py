@@ -149,6 +149,12 @@ def gaps(model, windows, qpos):
     return np.where(there, np.where(abs(residual) < ENDLESS, residual, np.inf), 0.0), there
 
 
+def squares(gap, known, noise):
+    """Parts (W,) of the squared error over all channels, in noises, by window. gap, known: see
+    gaps(); noise (nv,)."""
+    return ((gap / noise) ** 2).sum((1, 2)) / max(known.sum(), 1)
+
+
 def error(model, windows, qpos, noise):
     """The reported error of predictions qpos (W, T, nq): over all channels (in noises), and per
     channel (SI).
@@ -161,7 +167,7 @@ def error(model, windows, qpos, noise):
     for name, dofs in channels(model).items():
         if known[..., dofs].any():
             per_channel[name] = float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
-    return float(np.sqrt((square / noise**2).sum() / max(known.sum(), 1))), per_channel
+    return float(np.sqrt(squares(gap, known, noise).sum())), per_channel
 
 
 def pooled(noise):

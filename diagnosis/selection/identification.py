@@ -122,8 +122,8 @@ class Identification:
     def _elsewhere(self, found):
         """Fitted sets of the first round that leave something else than the best one did, best
         first, where the force that the search left follows anything by more than it scatters: what
-        is taken first may hide what needs another beside it. Names that predict worse than a curve
-        without a name are nothing to begin with, nor is that."""
+        is taken first may hide what needs another beside it. Neither a curve without a name is a
+        place to begin, nor are names that predict worse than one."""
         left = dependences(self.world, found.trajectory, self.train, most=1)
         if not left or left[0].above < ABOVE:
             return []
