@@ -26,11 +26,9 @@ from diagnosis.selection.identification import (
     LEVEL,
     Found,
     Identification,
-    changing,
     physics,
-    without,
 )
-from diagnosis.selection.judge import Fitted
+from diagnosis.selection.judge import Fitted, changing, without
 from diagnosis.selection.plausibility import plausible
 from diagnosis.unnamed import UNNAMED
 
@@ -206,10 +204,10 @@ def _beside(search, judge, fitted, rest, price):
     return beside
 
 
-def _classes(search, found, fitted, log, candidates):
+def _classes(search, found, fitted, log, candidates, asked=None):
     """(Fitted, {candidate: [(other, values)]}): the classes of its findings among candidates."""
     begun = lambda setting: search.begun(found.judge, setting)
-    return rivals.classes(candidates, found.judge, found.missing, fitted, begun, log)
+    return rivals.classes(candidates, found.judge, found.missing, fitted, begun, asked, log)
 
 
 def _at(world, candidate, joint):
@@ -249,7 +247,10 @@ def _hand_over(search, held, kept_back, outcome, log):
 
     def refit(some, out):  # what made up for a finding that goes may be another then
         pool[:] = [c for c in pool if c is not out]
-        fitted, outcome.others = _classes(search, found, judge.fit(some, steps=3), log, pool)
+        near = [c for c in some if rivals.meet(world, c, out)]
+        fitted, told = _classes(search, found, judge.fit(some, steps=3), log, pool, near)
+        told, still = {**outcome.others, **told}, set(pool) - set(fitted.setting)
+        outcome.others = {c: [o for o in told[c] if o[0] in still] for c in told}
         nothing = judge.fit({})
         fitted = search.pruned(judge, fitted, nothing)  # and what was earned beside it, not alone
         return fitted.setting if search.earned(nothing, fitted) else {}

@@ -59,8 +59,9 @@ def without_step(fitted, index):
     evidence = kind(columns.ahead, columns.residual, stack)
     every, none = np.arange(p + 1), np.zeros(p + 1)
     wide, amounts = half_widths(evidence, every)
-    g = evidence.freed(every, none)
-    whole = np.einsum("gc,gcij->ij", evidence.weight(g, none), g)[1:, 1:]
+    products = evidence.freed(every, none)
+    weight = evidence.weighed(evidence.square_of(products, none))
+    whole = products.weighed(weight).sum(0)[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     even = whole / np.outer(scale, scale)
     inside = even[:p, :p] + UNSEEN * np.eye(p)
@@ -79,9 +80,9 @@ def half_widths(evidence, index):
     p = len(index)
     if not p:
         return np.zeros(0), np.zeros(0)
-    g = evidence.freed(index, np.zeros(p))
-    weight = evidence.weight(g, np.zeros(p))
-    each = np.einsum("gc,gcij->gij", weight, g)
+    products = evidence.freed(index, np.zeros(p))
+    weight = evidence.weighed(evidence.square_of(products, np.zeros(p)))
+    each = products.weighed(weight)
     scale = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], 1e-300))
     gram, score = each[:, 1:, 1:] / np.outer(scale, scale), each[:, 1:, 0] / scale
     whole = gram.sum(0)
@@ -104,7 +105,7 @@ def half_widths(evidence, index):
         shares[k] = np.einsum("ij,jk,ki->i", inverse, H, inverse) / np.maximum(
             np.diag(inverse), 1e-300
         )
-    curvature = _curvature(g, weight, root / scale[:, None])
+    curvature = _curvature(products.slopes(), weight, root / scale[:, None])
     bread = root @ np.linalg.inv(curvature) @ root.T
     covariance = bread @ meat @ bread
     freedom = np.maximum(1 / np.maximum((shares**2).sum(0), 1e-9) - 1, 1.0)
@@ -113,13 +114,14 @@ def half_widths(evidence, index):
     return half / scale, moves / scale
 
 
-def _curvature(g, weight, root):
-    """The loss's curvature (p, p) over that of weighted least squares, in whitened columns.
+def _curvature(slopes, weight, root):
+    """The loss's curvature (p, p) over that of weighted least squares, in whitened columns, of
+    products (G, cells, p) of the residual with columns.
 
     The log of a cell's square bends less than the square itself, for a cell that errs much counts
     less: 1/2 log s has the second derivative X'X / ns - 2 X'r r'X / (ns)^2.
     """
-    score = g[:, :, 0, 1:] @ root
+    score = slopes @ root
     less = np.einsum("gc,gci,gcj->ij", 2 * weight**2, score, score)
     values, vectors = np.linalg.eigh(np.eye(len(root)) - less)
     return (vectors * np.clip(values, FLAT, None)) @ vectors.T

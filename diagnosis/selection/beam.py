@@ -51,6 +51,11 @@ class Beam:
         self.kept = tuple(k for k, o in enumerate(columns.options) if o.candidate in inside)
         self.free = [k for k, o in enumerate(columns.options) if o.candidate not in inside]
 
+    def leave(self, candidates):
+        """Look for sets without the options of some candidates from now on."""
+        options = self.columns.options
+        self.free = [k for k in self.free if options[k].candidate not in candidates]
+
     def node(self, options, by=None):
         """The Node of some options, as nodes_of() takes them."""
         return self.nodes_of([options], by)[0]
@@ -102,6 +107,12 @@ class Beam:
             if best >= before:
                 break
             before = best
+        return start, sorted(met.values(), key=lambda n: n.loss)
+
+    def alone(self):
+        """(node of the model as it is, nodes of single options beside it, best first)."""
+        start, met = self.node(self.kept), {}
+        self._joined(start, met)
         return start, sorted(met.values(), key=lambda n: n.loss)
 
     @staticmethod
@@ -174,9 +185,8 @@ class Beam:
         index, *_, precision, _ = problem(self.columns, node.options)
         gain = self.evidence.looks(index, node.score.amounts, precision)
         options, held = self.columns.options, self._candidates(node)
-        return {
-            k: gain[list(o.columns)].sum() for k, o in enumerate(options) if o.candidate not in held
-        }
+        others = [k for k in self.free if options[k].candidate not in held]
+        return {k: gain[list(options[k].columns)].sum() for k in others}
 
     def _looks(self, node):
         """Indices of the further options that promise most for their price in a first look."""

@@ -20,11 +20,11 @@ import numpy as np
 
 from diagnosis.common.distributions import t_sf
 from diagnosis.common.quadratic import bounded
+from diagnosis.selection.sums import INDEPENDENT, Sums
 
 NOISE = 0.3  # of the noise, that counts as none
 BEYOND = 1.5  # of the noise, from which on an error counts
 ITERATIONS = 4  # of reweighted least squares
-INDEPENDENT = 2.0  # errors as which the rows of a cell count, at most
 TOGETHER = 16  # hypotheses that are worked out at once
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
 
@@ -82,7 +82,7 @@ def paired(before, after):
 
 
 class Evidence:
-    """Sums of products of the residual (first) and columns per window and cell: everything a
+    """Sums of products of the residual (first) and columns per group and cell: everything a
     hypothesis needs.
 
     Start states are no part of a hypothesis. Each window's is free within what the smoother knows
@@ -108,9 +108,9 @@ class Evidence:
                 rows[w, j] = stack[w][:, dofs][inside[w]]
                 positions[w, j] = position[:, dofs][inside[w]]
         self.group = np.arange(groups)[:, None] == ahead.group  # (G, W)
-        self.rows, self.count = counted, self.group @ counted
+        self.count = self.group @ counted
         self.floor = (NOISE * self.noise) ** 2 + 1e-30
-        self._keep(rows, counted.shape, columns.shape[-1] + 1)
+        self.sums = Sums(rows, counted, self.group, columns.shape[-1] + 1)
         empty = [np.zeros(0, int)]  # of no rows
         self.position = np.concatenate([positions[k] for k in sorted(positions)] or empty)
         self.window_size = position.size  # rows by degrees of freedom
@@ -130,11 +130,10 @@ class Evidence:
         dimensions, the squared cosine between two windows' would be 1 / d in the mean. Windows
         weigh by how many cells count in them."""
         counting = self.group.T @ self._counting(self.square)  # (W, cells)
-        size = np.sqrt(counting / np.maximum(self._sums(self.columns[0] ** 2), 1e-300))
+        sums, residual = self.sums, self.sums.columns[0]
+        size = np.sqrt(counting / np.maximum(sums.sum(residual**2), 1e-300))
         scaled = np.zeros((len(counting), self.window_size))
-        scaled[self.cell // self.shape[1], self.position] = (
-            self.columns[0] * size.ravel()[self.cell]
-        )
+        scaled[sums.cell // sums.shape[1], self.position] = residual * size.ravel()[sums.cell]
         products = scaled @ scaled.T
         count, others = np.diag(products), ~np.eye(len(products), dtype=bool)
         alike = (products[others] ** 2).sum()
@@ -144,98 +143,22 @@ class Evidence:
         windows = len(products) / len(self.group)  # that a group's cell holds
         return min(windows * dimensions * count.sum() / (count**2).sum(), INDEPENDENT)
 
-    def _keep(self, rows, shape, width):
-        """Keep rows {(window, cell): (n, width + m)}, columns first, and their products with the
-        starts.
-
-        Products of all columns with all would take the square of their number: those asked for are
-        worked out when they are.
-        """
-        where, self.shape = sorted(rows), shape
-        every = np.concatenate([rows[k] for k in where]).T if rows else np.zeros((width, 0))
-        lengths = [len(rows[k]) for k in where]
-        self.first = np.cumsum([0, *lengths[:-1]]) if rows else np.zeros(0, int)
-        self.cell = np.repeat(np.array([w * shape[1] + j for w, j in where], int), lengths)
-        self.columns, begun = np.ascontiguousarray(every[:width]), every[width:]
-        m = len(begun)
-        self.starts, self.crossed = np.zeros((*shape, m, m)), np.zeros((*shape, m, width))
-        for (w, j), a, n in zip(where, self.first, lengths):
-            block = begun[:, a : a + n]
-            self.starts[w, j] = block @ block.T
-            self.crossed[w, j] = block @ self.columns[:, a : a + n].T
-
-    def _sums(self, product):
-        """(..., W, cells) of products of columns (..., N)."""
-        out = np.zeros((*product.shape[:-1], self.shape[0] * self.shape[1]))
-        if product.shape[-1]:
-            out[..., self.cell[self.first]] = np.add.reduceat(product, self.first, axis=-1)
-        return out.reshape(*product.shape[:-1], *self.shape)
-
-    def _products(self, index):
-        """(..., W, cells, p, p): sums of products of columns index (..., p), 0 being the residual,
-        start states as they are."""
-        *some, p = index.shape
-        chosen = self.columns[index]
-        out = np.empty((*some, *self.shape, p, p))
-        for i in range(p):
-            for j in range(i + 1):
-                sums = self._sums(chosen[..., i, :] * chosen[..., j, :])
-                out[..., i, j] = out[..., j, i] = sums
-        return out
-
-    def _crossed(self, index):
-        """(..., W, cells, m, p): products of the starts with columns index (..., p)."""
-        out = self.crossed[..., index]
-        return np.moveaxis(out, range(3), range(index.ndim - 1, index.ndim + 2))
-
-    def _moved(self, crossed, square):
-        """(..., W, m, p): how many standard deviations start states follow columns, from their
-        products crossed (..., W, cells, m, p) with the starts, where errors are of mean squares
-        (..., G, cells)."""
-        # rows err alike where a model does: those of a cell count as few errors
-        weight = (
-            INDEPENDENT / np.maximum(self.rows, 1) * (self.group.T @ (1 / (square + self.floor)))
-        )
-        m = self.starts.shape[-1]
-        inside = np.einsum("...wc,wcij->...wij", weight, self.starts) + np.eye(m)
-        return np.linalg.solve(inside, np.einsum("...wc,...wcip->...wip", weight, crossed))
-
-    def _freed(self, products, crossed, square):
-        """(..., G, cells, p, p): products of columns from which start states have taken their
-        share."""
-        moved = self._moved(crossed, square)[..., None, :, :]
-        shared = np.swapaxes(crossed, -1, -2) @ moved
-        left = products - shared - np.swapaxes(shared, -1, -2)
-        left += np.swapaxes(moved, -1, -2) @ self.starts @ moved
-        return self._grouped(left)
-
-    def _grouped(self, products):
-        """(..., G, cells, p, p) of products (..., W, cells, p, p)."""
-        *some, windows, cells, p, _ = products.shape
-        flat = products.reshape(*some, windows, cells * p * p)
-        return (self.group.astype(float) @ flat).reshape(*some, len(self.group), cells, p, p)
-
     def freed(self, columns, amounts):
-        """(G, cells, p + 1, p + 1): sums of products of the residual and columns (p,), start states
-        free, where these have amounts (p,)."""
+        """Products of the residual and columns (p,), start states free, where these have amounts
+        (p,)."""
         index = np.concatenate([[0], np.asarray(columns, int) + 1])
-        products, crossed = self._products(index), self._crossed(index)
-        g = self._grouped(products)
+        products = self.sums.of(index)
         for _ in range(ITERATIONS):
-            g = self._freed(products, crossed, self._square(g, amounts))
-        return g
+            products = products.freed(self.square_of(products, amounts), self.floor)
+        return products
 
     def squares(self, columns, amounts):
         """Mean squared error (G, cells) at amounts (p,) of columns (p,)."""
-        return self._square(self.freed(columns, amounts), amounts)
+        return self.square_of(self.freed(columns, amounts), amounts)
 
-    def _square(self, g, amounts):
-        """Mean squared error (..., G, cells) of amounts (p,) or (..., G or 1, p), from products
-        g."""
-        z = np.concatenate([np.ones((*amounts.shape[:-1], 1)), -amounts], -1)
-        z = np.atleast_2d(z)[..., None, :, None]
-        square = (np.swapaxes(z, -1, -2) @ (g @ z))[..., 0, 0]
-        return np.maximum(square, 0.0) / np.maximum(self.count, 1)
+    def square_of(self, products, amounts):
+        """Mean squared error (..., G, cells) of amounts (p,) or (..., G, p), from Products."""
+        return products.squares(amounts) / np.maximum(self.count, 1)
 
     def _counting(self, square):
         """How much cells of mean squared errors (G, cells) count, 0 to 1: by their excess."""
@@ -268,8 +191,8 @@ class Evidence:
     def different(self):
         """How many columns are different: the effective number of independent tests, of their
         correlations' eigenvalues (Galwey 2009, doi:10.1002/gepi.20408)."""
-        weight = self.group.T @ self._weighed(self.reference)
-        x = self.columns[1:] * np.sqrt(weight.ravel()[self.cell])
+        weight = self.group.T @ self.weighed(self.reference)
+        x = self.sums.columns[1:] * np.sqrt(weight.ravel()[self.sums.cell])
         size = np.linalg.norm(x, axis=1)
         x = x[size > 0] / size[size > 0, None]
         values = np.maximum(np.linalg.eigvalsh(x @ x.T), 0.0)
@@ -313,46 +236,47 @@ class Evidence:
         """[Score] of hypotheses, arguments (B, p)."""
         index = np.concatenate([np.zeros((len(columns), 1), int), columns + 1], -1)
         prior = precision[:, :, None] * np.eye(columns.shape[1]), pull, low, high
-        g, amounts = self._fitted(self._products(index), self._crossed(index), prior)
-        each = np.einsum("bgc,bgcij->bgij", self.weight(g, amounts[:, None]), g)
+        products, amounts, square = self._fitted(self.sums.of(index), prior)
+        each = products.weighed(self.weighed(square))
         rest = each.sum(1, keepdims=True) - each
         matrix, vector, low, high = (x[:, None] for x in prior)
         matrix, vector = rest[..., 1:, 1:] + matrix, rest[..., 1:, 0] + vector
-        squares = self._square(g, bounded(matrix, vector, low, high))
+        squares = self.square_of(products, bounded(matrix, vector, low, high))
         return [self._scored(square, own) for square, own in zip(squares, amounts)]
 
-    def _fitted(self, products, crossed, prior):
-        """(products of the groups, start states free (B, G, cells, p, p), amounts (B, p)) of the
-        lowest sums of logs.
+    def _fitted(self, products, prior):
+        """(Products, start states free, amounts (B, p), mean squares (B, G, cells)) of the lowest
+        sums of logs.
 
         That has several minima: in groups where the nominal model happens to do well, a fit that
         begins at its errors would keep them. So it begins there, and where all groups weigh alike.
         """
         precision, pull, low, high = prior
-        nominal, found = self._grouped(products), []
-        square = nominal[..., 0, 0] / np.maximum(self.count, 1)
+        found = []
+        square = products.grouped[..., 0, 0] / np.maximum(self.count, 1)
         alike = (square * self.count).sum(-2, keepdims=True) / np.maximum(self.count.sum(0), 1)
         for begun in (square, np.broadcast_to(alike, square.shape)):
-            g = nominal
+            free = products
             for _ in range(ITERATIONS):
-                whole = np.einsum("bgc,bgcij->bij", self._weighed(begun), g)
+                whole = free.weighed(self.weighed(begun)).sum(1)
                 matrix, vector = whole[:, 1:, 1:] + precision, whole[:, 1:, 0] + pull
                 amounts = bounded(matrix, vector, low, high)
-                g = self._freed(products, crossed, self._square(g, amounts[:, None]))
-                begun = self._square(g, amounts[:, None])
+                free = products.freed(self.square_of(free, amounts), self.floor)
+                begun = self.square_of(free, amounts)
             cost = np.einsum("bi,bij,bj->b", amounts, precision / 2, amounts)
             cost -= (amounts * pull).sum(-1)
             loss = 0.5 * np.log(begun + self.floor)[:, self.count > 0].sum(-1) + cost
-            found.append((loss, g, amounts))
+            found.append((loss, free.moved, amounts, begun))
         (first, *one), (second, *other) = found
         lower = second < first
-        return [np.where(lower.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(one, other)]
+        moved, amounts, square = (
+            np.where(lower.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(one, other)
+        )
+        return replace(products, moved=moved), amounts, square
 
-    def weight(self, g, amounts):
-        """(G, cells): weights of squares at which least squares lowers the sum of logs."""
-        return self._weighed(self._square(g, amounts))
-
-    def _weighed(self, square):
+    def weighed(self, square):
+        """(G, cells): weights of squares at which least squares lowers the sum of logs, where
+        errors are of mean squares (G, cells)."""
         return np.where(
             self.count > 0, 1 / (np.maximum(self.count, 1) * (square + self.floor)), 0.0
         )
@@ -360,19 +284,18 @@ class Evidence:
     def looks(self, columns, amounts, precision):
         """In-sample gain (K,) in nats of each further column beside some at their amounts: a first
         look."""
-        index = np.concatenate([[0], np.asarray(columns, int) + 1])
-        g = self.freed(columns, np.asarray(amounts, float))
-        square = self._square(g, np.asarray(amounts, float))
-        weight = self.group.T @ self.weight(g, np.asarray(amounts, float))  # (W, cells)
-        moved = self._moved(self.crossed, square)
-        crossed = np.einsum("wc,wcik->wik", weight, self.crossed)
+        index, sums = np.concatenate([[0], np.asarray(columns, int) + 1]), self.sums
+        square = self.squares(columns, np.asarray(amounts, float))
+        weight = self.group.T @ self.weighed(square)  # (W, cells)
+        moved = sums.moved(sums.crossed, square, self.floor)
+        crossed = np.einsum("wc,wcik->wik", weight, sums.crossed)
         # of each column what start states leave of it: x - S moved
-        taken = crossed - np.einsum("wc,wcij->wij", weight, self.starts) @ moved / 2
-        row = weight.ravel()[self.cell]
-        beside = self.columns @ (self.columns[index] * row).T
+        taken = crossed - np.einsum("wc,wcij->wij", weight, sums.starts) @ moved / 2
+        row = weight.ravel()[sums.cell]
+        beside = sums.columns @ (sums.columns[index] * row).T
         beside -= np.einsum("wik,wip->kp", taken, moved[..., index])
         beside -= np.einsum("wik,wip->kp", moved, taken[..., index])
-        own = np.einsum("kn,n,kn->k", self.columns, row, self.columns)
+        own = np.einsum("kn,n,kn->k", sums.columns, row, sums.columns)
         own = (own - 2 * np.einsum("wik,wik->k", taken, moved))[1:]
         inside = beside[index[1:], 1:] + np.diag(precision)
         score = beside[1:, 0] - beside[1:, 1:] @ amounts

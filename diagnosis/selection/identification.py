@@ -16,9 +16,9 @@ from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import LEAST, Beam
 from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import PRICE, Evidence, Score, complexity, paired
+from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.first_look import likely
-from diagnosis.selection.judge import Fitted, Judge, problem
+from diagnosis.selection.judge import Fitted, Judge, without
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.rivals import TIED, as_good, carried
@@ -74,7 +74,7 @@ class Identification:
         setting = setting or {}
         if setting:
             trajectory = smoother.locate(setting, first, passes=1)
-        known = first.located()[0], (first.qpos, first.qvel)
+        known = first.located()[0], (first.qpos, first.qvel), first.force
         self.usual = Usual(self.world, self.train, smoother.scale, *known)
         ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
         self.windows = ahead, Chain(self.world, ahead.windows, smoother.position_noise)
@@ -105,8 +105,9 @@ class Identification:
             self._begin(setting, trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
             judge = self.judge()
-            fitted, better = self._round(setting, judge)
-            if not better or (rival and judge.fit(rival).loss <= fitted.loss):
+            most = judge.fit(rival).loss if rival else np.inf
+            fitted, better = self._round(setting, judge, most)
+            if not better or fitted.loss >= most:
                 break
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory, passes=1)
@@ -139,6 +140,8 @@ class Identification:
         """A Found without what it does not need, if that is better than another one by its own
         judge, and earned over the nominal model in finer steps; or None."""
         judge, before = again.judge, again.judge.fit(found.fitted.setting)
+        if again.fitted.score.loss >= before.loss:  # whatever of it is not needed
+            return None
         nothing = self.finer(judge, judge.fit({}))
         fitted = self.pruned(judge, again.fitted, nothing)
         self.log(f" ends {fitted.loss:.3f}, before {before.loss:.3f}")
@@ -156,8 +159,9 @@ class Identification:
         ahead.start(copy(self.smoother).locate(setting, self.trajectory, passes=2), setting)
         return Judge(ahead, self.usual, judge.reference, self.seen)
 
-    def _round(self, setting, judge):
-        """(Fitted, whether it holds other effects than there were)."""
+    def _round(self, setting, judge, most):
+        """(Fitted, whether it holds other effects than there were); most: a loss from which on it
+        is of no use, whatever of it is not needed."""
         others = [c for c in self.candidates if c not in setting]
         every, curves = [*setting, *others], self._curves(setting)
         starts = Starts(self.world, setting, self.usual, self.seen, self.trajectory)
@@ -169,29 +173,50 @@ class Identification:
         columns.secants(columns.evidence(nominal))
         evidence = columns.evidence(nominal)
         self.looked = max(evidence.different(), 1.0)
-        beam = Beam(columns, evidence, missing)
-        start, nodes = beam.nodes()
-        self.log(
-            f"{len(columns.parts)} columns, {columns.simulated} simulated; loss {start.loss:.3f}"
-        )
-        now = judge.fit(setting)
-        judged = [now]
-        for node in self._finalists(beam, start, nodes):
-            fitted = judge.fit(beam.setting(node), steps=3, near=now)
-            p = paired(now.score, fitted.score).p_value
-            losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
-            self.log(f"  {losses} {'' if fitted.settled else '(limit) '}{said(fitted.setting)}")
-            judged.append(fitted)
-            if not fitted.settled:  # what has no value may hide others that have
-                judged.append(judge.fit(fitted.inside, steps=3, near=fitted))
+        beam, now = Beam(columns, evidence, missing), judge.fit(setting)
+        self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; {now.loss:.3f}")
         if self.judged is None:  # the first look of all
+            self.ranking = self._ranking(beam)
+        judged = self._judged(judge, beam, now)
+        if self.judged is None:
             bare = [f for f in judged if f.settled and not physics(f.setting) - set(setting)]
-            least = min([now, *bare], key=lambda f: f.loss)
+            least = min(bare, key=lambda f: f.loss)
             self.judged = [f for f in judged if f.settled and self.earned(least, f)]
-            self.ranking = self._ranking(beam, start, nodes)
-        best = self._ended(judge, self._choose(judged, now), now)
+        best = self._choose(judged, now)
+        if best.score.loss >= most:
+            return best, False
+        best = self._ended(judge, best, now)
         best = self._beside(judge, judged, now, best)
         return best, best.setting.keys() != setting.keys()
+
+    def _judged(self, judge, beam, now):
+        """[Fitted] of what there was and of the sets that a beam finds. What ends at a bound of the
+        plausible has no value, and may hide what has one: then sets are judged without what there
+        was of it, and looked for without what is new."""
+        fits, inside = {}, []
+        while True:
+            sets, alone = self._finalists(beam, *beam.nodes())
+            for node in sets + alone:
+                new = node.options not in fits
+                if new:
+                    fits[node.options] = self._judge(judge, beam, node, now)
+                fitted = fits[node.options]
+                limited = fitted.setting.keys() - fitted.inside.keys()
+                if new and limited & now.setting.keys():
+                    inside.append(judge.fit(fitted.inside, steps=3, near=fitted))
+                if node in sets and limited - now.setting.keys():
+                    break
+            else:
+                return [now, *fits.values(), *inside]
+            beam.leave(limited)
+
+    def _judge(self, judge, beam, node, now):
+        """The Fitted set of a Node."""
+        fitted = judge.fit(beam.setting(node), steps=3, near=now)
+        p = paired(now.score, fitted.score).p_value
+        losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
+        self.log(f"  {losses} {'' if fitted.settled else '(limit) '}{said(fitted.setting)}")
+        return fitted
 
     def _beside(self, judge, judged, now, best):
         """The best set, or the one of an earlier round that is better with what is new; sets that
@@ -213,10 +238,10 @@ class Identification:
         return [(d.candidate, d.values) for d in found if d.joint not in taken][:CURVES]
 
     def _finalists(self, beam, start, nodes):
-        """Nodes for the simulator, best first: of other effects, not a better one and more, and not
-        one that predicts the same: classes are told later. A column begun far from the truth may
-        not be worth its price yet, but no chance. Then the best single effects: where something
-        touches, columns tell little of whole values."""
+        """Two lists of Nodes for the simulator, best first. Sets of other effects, not a better one
+        and more, and not one that predicts the same: classes are told later. A column begun far
+        from the truth may not be worth its price yet, but no chance. And the best single effects
+        beside them: where something touches, columns tell little of whole values."""
         chosen, seen = [], []
         for node in nodes:
             if len(chosen) == FINALISTS:
@@ -237,7 +262,7 @@ class Identification:
         for node in nodes:
             if len(node.options) == len(start.options) + 1:
                 alone.setdefault(one(beam.columns.options[node.options[-1]].candidate), node)
-        return chosen + [n for n in list(alone.values())[:ALONE] if n not in chosen]
+        return chosen, [n for n in list(alone.values())[:ALONE] if n not in chosen]
 
     def _choose(self, judged, now):
         """The simplest set that is earned over what there was and over which the best set is not
@@ -293,6 +318,7 @@ class Identification:
         """Without the effects that do not earn their place beside the others, as long as what stays
         is earned over what there was: together effects may be earned of which none is. Those that
         small changes show to be needed are not tried without."""
+        whole = fitted
         while len(fitted.setting) > 1:
             rest = lambda out: {c: v for c, v in fitted.setting.items() if c is not out}
             tries = [
@@ -305,8 +331,8 @@ class Identification:
                 self.log(f"  without: {less.loss:.3f} {said(less.setting)}; p {step.p_value:.2g}")
             if less is None or self.earned(less, fitted):
                 break
-            fitted = judge.fit(less.setting)
-        return fitted
+            fitted = judge.fit(less.setting, near=less)
+        return fitted if fitted is whole else judge.fit(fitted.setting)
 
     def _missed_least(self, fitted):
         """Up to TRIED effects of a set that may not earn their place."""
@@ -315,49 +341,15 @@ class Identification:
         return sorted(some, key=lambda c: left[c].loss)[:TRIED]
 
     @staticmethod
-    def _ranking(beam, start, nodes):
-        """[(candidate, loss removed alone, p-value)], most first, of nodes with the best first."""
-        best = {}
+    def _ranking(beam):
+        """[(candidate, loss removed alone, p-value)], most first."""
+        (start, nodes), best = beam.alone(), {}
         for node in nodes:
-            if len(node.options) == len(start.options) + 1:
-                candidate = beam.columns.options[node.options[-1]].candidate
-                if candidate not in best:
-                    p = paired(start.score, node.score).p_value
-                    best[candidate] = candidate, start.loss - node.loss, p
+            candidate = beam.columns.options[node.options[-1]].candidate
+            if candidate not in best:
+                p = paired(start.score, node.score).p_value
+                best[candidate] = candidate, start.loss - node.loss, p
         return list(best.values())
-
-
-@dataclass(frozen=True)
-class Left:
-    """What is left of a Fitted set in a first look."""
-
-    score: Score
-    loss: float
-    setting: dict
-
-
-def without(fitted, candidate):
-    """Left when an effect of a Fitted set becomes nominal and the others move, as far as small
-    changes tell. Of a limit that there was not they tell nothing, so it is as if none missed it."""
-    columns = fitted.columns
-    index, low, high, precision, pull = problem(columns, range(len(columns.options)))
-    away = np.array(candidate.nominal) - fitted.setting[candidate]
-    for option in columns.options:
-        if option.candidate is candidate:
-            gone = [away[row != 0][0] / row[row != 0][0] for row in option.directions]
-            if not np.isfinite(gone).all():
-                return Left(fitted.score, -np.inf, {})
-            low[list(option.columns)] = high[list(option.columns)] = gone
-    score = fitted.evidence.score(index, low, high, precision, pull)
-    rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    return Left(score, score.loss + PRICE * complexity(rest), rest)
-
-
-def changing(judge, fitted):
-    """A Fitted set without the effects whose values became the nominal ones."""
-    same = [c for c, v in fitted.setting.items() if np.allclose(v, c.nominal, rtol=1e-6, atol=0)]
-    rest = {c: v for c, v in fitted.setting.items() if c not in same}
-    return judge.fit(rest, steps=0) if same else fitted
 
 
 def one(candidate):

@@ -159,6 +159,39 @@ def problem(columns, chosen):
     )
 
 
+@dataclass(frozen=True)
+class Left:
+    """What is left of a Fitted set in a first look."""
+
+    score: Score
+    loss: float
+    setting: dict
+
+
+def without(fitted, candidate):
+    """Left when an effect of a Fitted set becomes nominal and the others move, as far as small
+    changes tell. Of a limit that there was not they tell nothing, so it is as if none missed it."""
+    columns = fitted.columns
+    index, low, high, precision, pull = problem(columns, range(len(columns.options)))
+    away = np.array(candidate.nominal) - fitted.setting[candidate]
+    for option in columns.options:
+        if option.candidate is candidate:
+            gone = [away[row != 0][0] / row[row != 0][0] for row in option.directions]
+            if not np.isfinite(gone).all():
+                return Left(fitted.score, -np.inf, {})
+            low[list(option.columns)] = high[list(option.columns)] = gone
+    score = fitted.evidence.score(index, low, high, precision, pull)
+    rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
+    return Left(score, score.loss + PRICE * complexity(rest), rest)
+
+
+def changing(judge, fitted):
+    """A Fitted set without the effects whose values became the nominal ones."""
+    same = [c for c, v in fitted.setting.items() if np.allclose(v, c.nominal, rtol=1e-6, atol=0)]
+    rest = {c: v for c, v in fitted.setting.items() if c not in same}
+    return judge.fit(rest, steps=0) if same else fitted
+
+
 def moved_setting(columns, amounts, chosen=None):
     """The setting after the amounts of some options (all of them by default), one option after the
     other."""

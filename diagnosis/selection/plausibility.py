@@ -49,7 +49,7 @@ TABLE = {
     "backlash": [("travel", 0.05, 0.0, 0.3)],
     "gain": [("times", 0.25, 0.2, 5.0)],
     "bias": [("force", 0.5, -2.0, 2.0)],  # in a drive on a joint it is a spring_offset
-    "saturation": [("used", np.inf, 0.05, np.inf)],
+    "saturation": [("given", np.inf, 0.05, np.inf)],
     "torque_speed": [("plain", np.inf, 0.0, np.inf), ("used", np.inf, 0.05, np.inf)],
     "delay": [("plain", 0.03, 0.0, 0.15)],
     "lag": [("plain", 0.03, 0.0, 0.3)],
@@ -122,16 +122,17 @@ class Usual:
     """What a machine usually does: force (nv,), speed (nv,) and travel (nv,) of each dof, forces
     asked of actuators."""
 
-    def __init__(self, world, recordings, force, missing=None, motion=None):
+    def __init__(self, world, recordings, force, missing=None, motion=None, lacking=None):
         """missing (nv,): RMS of the force that the nominal model lacks, if it is located. motion:
-        (qpos, qvel) of all rows, smoothed; by default as they were measured."""
+        (qpos, qvel) of all rows, smoothed; by default as they were measured. lacking (n, nv): that
+        force in these rows."""
         model = world.model
         measured = zip(*(windowing.states(model, r) for r in recordings))
         self.motion = motion or [np.concatenate(x) for x in measured]
         qpos, qvel = self.motion
         gone = windowing.difference(model, np.broadcast_to(model.qpos0, qpos.shape), qpos)
         self.model, self.force, self.recordings = model, force, recordings
-        self.missing = missing
+        self.missing, self.lacking = missing, lacking
         self.speed = np.sqrt(np.mean(qvel**2, axis=0)) + 1e-9
         self.travel = np.quantile(abs(gone), 0.95, axis=0) + 1e-9
         self.range = np.ptp(np.quantile(gone, [0.01, 0.99], axis=0), axis=0) + 1e-9
@@ -162,6 +163,8 @@ class Usual:
             servo = model.actuator_biasprm[i, 1:3].any()
             motor = candidate.effect.name == "dead_zone" and not servo
             return max(used, 1e-9) / (abs(model.actuator_gainprm[i, 0]) if motor else 1.0)
+        if kind == "given":
+            return self._given(candidate)
         if d is None:
             return np.inf
         if kind == "missing":
@@ -178,6 +181,18 @@ class Usual:
             "per travel³": self.force[d] / self.travel[d] ** 3,
             "travel": self.range[d],
         }[kind]
+
+    def _given(self, candidate):
+        """What a drive gave at most, as far as the motion tells: what a servo asks for grows with
+        its error, so of that what the motion needed; of a motor, what was asked for."""
+        model, d = self.model, self.dof(candidate.place)
+        i = model.actuator(candidate.place.name).id
+        if d is None or self.lacking is None or not model.actuator_biasprm[i, 1:3].any():
+            return self.unit("used", candidate)
+        told = asked(model, i, *self.motion, np.concatenate([r.ctrl for r in self.recordings]))
+        nominal, gear = model.actuator_gainprm[i, 0] * told, model.actuator_gear[i, 0]
+        given = nominal + self.lacking[:, d] / gear
+        return max(np.nanquantile(abs(given), 0.995), 1e-9)
 
     def _times(self, curve):
         """RMS of what a curve is multiplied by."""

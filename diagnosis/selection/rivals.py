@@ -31,16 +31,19 @@ REFITS, MOST = 4, 3  # others that are refitted, and told
 SETS = 3  # of other effects, that are carried from round to round
 
 
-def classes(candidates, judge, missing, fitted, begun, log=lambda what: None):
+def classes(candidates, judge, missing, fitted, begun, asked=None, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
     its price, and the other members. Among equals the finding stays. missing: a MissingForce along
     the motion; begun(setting): a Judge whose windows begin at the motion that is located under a
-    setting. A finer time step is no physics, so nothing is asked for in its place."""
-    others, swapped = {}, False
-    for candidate in list(fitted.setting):
+    setting; asked: the findings whose class is asked, all by default. A finer time step is no
+    physics, so nothing is asked for in its place."""
+    others, swapped, held = {}, False, None
+    for candidate in fitted.setting if asked is None else asked:
         if candidate not in fitted.setting or candidate.effect.numerical:
             continue
-        members = _members(candidates, judge, missing, fitted, candidate)
+        if held is None or held.setting != fitted.setting:
+            held = _along(missing.chain, judge, fitted.setting)
+        members = _members(candidates, judge, missing, fitted, candidate, held)
         units, most = complexity(fitted.setting), fitted.loss - TIED
         better = [m for m in members if m[0].loss < most or complexity(m[0].setting) < units]
         members.append((fitted, candidate))
@@ -102,9 +105,16 @@ def _instead(rival, fitted):
     return (new, gone) if alike and new and gone else None
 
 
-def _members(candidates, judge, before, fitted, candidate):
+def _along(chain, judge, setting):
+    """Columns of a setting's effects about it, along a Chain."""
+    starts = Starts(chain.world, setting, judge.usual, trajectory=chain.trajectory)
+    return Columns(chain, setting, starts.of(setting))
+
+
+def _members(candidates, judge, before, fitted, candidate, held):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
-    their price, best first, and against which the missing force does not speak."""
+    their price, best first, and against which the missing force does not speak. held: Columns of
+    the Fitted set."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting]
     missing, out = MissingForce(before.chain, rest, before), []
@@ -112,13 +122,13 @@ def _members(candidates, judge, before, fitted, candidate):
     twin = lambda c: (c.effect, c.nominal) == (candidate.effect, candidate.nominal)
     twins = [c for c in _near(before.chain.world, candidate, pool) if twin(c)]
     near = [(c, fitted.setting[candidate]) for c in twins]
-    alike = _alike(judge, missing, fitted, candidate, pool)
+    alike = _alike(judge, missing, candidate, pool, held)
     near += [(other, values) for other, values in alike if other not in twins]
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, steps=2, near=fitted)
         if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
             continue
-        tried = judge.fit(tried.setting)  # forces tell values better than the motion
+        tried = judge.fit(tried.setting, near=tried)  # forces tell values better than the motion
         apart = before.chain.apart(other) or before.chain.apart(candidate)
         lacks = None if apart else missing.scores(tried.setting, fitted.setting)
         if lacks is None or _tied(*lacks):
@@ -150,9 +160,9 @@ def _tied(tried, fitted):
     return worse.gain < TIED or worse.p_value > CHANCE
 
 
-def _alike(judge, missing, fitted, candidate, pool):
+def _alike(judge, missing, candidate, pool, held):
     """[(other, values)] that predict about as well in the candidate's place as far as columns tell,
-    the best first.
+    the best first. held: Columns of the set, which stand for those without the candidate.
 
     Asked at the model without the finding, for what is gone there is what the others have to
     explain.
@@ -160,11 +170,10 @@ def _alike(judge, missing, fitted, candidate, pool):
     chain, rest = missing.chain, missing.setting
     near = _near(chain.world, candidate, pool) + list(rest)
     starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory).of(near)
-    columns = Columns(chain, rest, likely(missing, starts))
+    columns = Columns(chain, rest, likely(missing, starts), known=held)
     options, evidence = columns.options, columns.evidence(judge.reference)
     kept = [k for k, o in enumerate(options) if o.candidate in rest]
-    gap = chain.residual([fitted.setting])[0]
-    gap = gap + APART * (columns.residual - gap)
+    gap = held.residual + APART * (columns.residual - held.residual)
     most = Evidence(chain, gap, columns.array, judge.reference).score(*problem(columns, kept)).loss
     out = {}
     for k in set(range(len(options))) - set(kept):
@@ -180,13 +189,11 @@ def _alike(judge, missing, fitted, candidate, pool):
 
 def _near(world, candidate, pool):
     """Candidates of a pool that act where a finding does, or everywhere."""
-    mine = world.joints(candidate.place)
     most = complexity([candidate]) + FURTHER
-    out = []
-    for other in pool:
-        theirs = world.joints(other.place)
-        if complexity([other]) > most:
-            continue
-        if mine is None or theirs is None or mine & theirs:
-            out.append(other)
-    return out
+    return [c for c in pool if complexity([c]) <= most and meet(world, c, candidate)]
+
+
+def meet(world, candidate, other):
+    """Whether two candidates act at one joint, or either of them everywhere."""
+    mine, theirs = world.joints(candidate.place), world.joints(other.place)
+    return mine is None or theirs is None or bool(mine & theirs)

@@ -106,6 +106,17 @@ def test_of_options_that_promise_the_same_the_simplest_is_tried_first(monkeypatc
     assert [beam.columns.options[k].candidate.name for k in beam._looks(node)] == ["near"]
 
 
+def test_sets_are_met_without_what_is_left_out():
+    rng, ahead = np.random.default_rng(4), scene()
+    first, second, rest = (clustered(rng, ahead, share=0.0) for _ in range(3))
+    named = {"first": first, "second": second, "both": first + second + 0.3 * rest}
+    beam, names = made(named, first + second + 0.01 * rest, ahead)
+    assert "first" in names(beam.nodes()[1][0])
+    beam.leave({beam.columns.options[0].candidate})
+    start, nodes = beam.nodes()
+    assert not any("first" in names(node) for node in nodes) and "both" in names(nodes[0])
+
+
 def test_what_many_joints_lack_is_met_at_once_where_the_missing_force_shows_it(monkeypatch):
     monkeypatch.setattr(beam_module, "DEPTH", 1)
     rng, ahead = np.random.default_rng(4), scene(channels=6)

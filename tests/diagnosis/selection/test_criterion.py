@@ -234,7 +234,7 @@ def test_a_first_look_is_the_gain_of_least_squares(moves):
     evidence = evidence_of(ahead, residual, columns)
     start = free(evidence, (1,))
     gains = evidence.looks((1,), start.amounts, np.zeros(1))
-    weight = evidence.weight(evidence.freed((1,), start.amounts), start.amounts)
+    weight = evidence.weighed(evidence.squares((1,), start.amounts))
     rows = np.sqrt(weight[ahead.group])[:, None, :] * np.ones(ahead.known.shape)
     if moves:
         every = np.array([0.0, start.amounts[0], 0.0, 0.0])

@@ -10,6 +10,7 @@ from arm import ARM
 from diagnosis.selection import identification
 from diagnosis.selection.criterion import PRICE, Comparison, Score
 from diagnosis.selection.identification import Identification
+from diagnosis.selection.judge import changing
 from diagnosis.selection.unmodelled_force import Dependence
 from diagnosis.simulation.simulator import World
 
@@ -173,9 +174,9 @@ def test_finalists_are_worth_their_price_or_no_chance_and_predict_differently(se
     luck = node(noise + np.where(np.arange(16) == 3, -3.0, 0.0), 0.6, 3)
     more = node(noise - 0.7, 0.3, 0, 4)
     nodes = sorted([worth, dear, same, luck, more], key=lambda n: n.loss)
-    finalists = search._finalists(beam, start, nodes)
-    assert finalists[:3] == [more, worth, dear]
-    assert finalists[3:] == [same, luck]  # simple sets are judged whatever columns tell of them
+    finalists, alone = search._finalists(beam, start, nodes)
+    assert finalists == [more, worth, dear]
+    assert alone == [same, luck]  # simple sets are judged whatever columns tell of them
 
 
 def test_single_curves_of_a_joint_take_one_place_among_those_that_are_judged(search):
@@ -185,7 +186,7 @@ def test_single_curves_of_a_joint_take_one_place_among_those_that_are_judged(sea
     effects = [SimpleNamespace(candidate=c) for c in (*curves, search.world.candidates[0])]
     beam = SimpleNamespace(columns=SimpleNamespace(options=effects))
     nodes = [node(noise + chance, 0.2 + 0.01 * k, k) for k in range(6)]
-    assert search._finalists(beam, node(noise, 0.0), nodes) == [nodes[0], nodes[5]]
+    assert search._finalists(beam, node(noise, 0.0), nodes) == ([], [nodes[0], nodes[5]])
 
 
 def test_a_finer_step_makes_no_other_explanation_of_a_set(search):
@@ -196,7 +197,51 @@ def test_a_finer_step_makes_no_other_explanation_of_a_set(search):
     finer, plain = node(noise - 0.6, 0.2, 0, 1, 4), node(noise - 0.5, 0.2, 0, 1)
     other, alone = node(noise - 0.4, 0.2, 2, 3), node(noise - 0.3, 0.1, 4)
     finalists = search._finalists(beam, node(noise, 0.0), [finer, plain, other, alone])
-    assert finalists == [finer, other, alone]
+    assert finalists == ([finer, other, alone], [])
+
+
+def limited(search, beyond, kept=()):
+    """What is judged, [names], where values of the effects `beyond` end at a bound: of a beam that
+    finds two sets of the first four effects, and further ones when it leaves some out."""
+    some = [search.world.candidates[k] for k in range(4)]
+    left, fits = set(), []
+
+    def fit(setting, steps, near):
+        fits.append([some.index(c) for c in setting])
+        inside = {c: v for c, v in setting.items() if some.index(c) not in beyond}
+        score = Score(0.0, np.zeros(4), np.zeros(4), ())
+        return SimpleNamespace(
+            setting=setting, inside=inside, settled=inside == setting, loss=0.0, score=score
+        )
+
+    def nodes():
+        found = [
+            n for n in (node([0.0], 0.0, 0, 1), node([0.0], 0.0, 2, 3)) if not left & set(n.options)
+        ]
+        return None, found or [node([0.0], 0.0, *(k for k in range(4) if k not in left))]
+
+    beam = SimpleNamespace(
+        nodes=nodes,
+        leave=lambda candidates: left.update(map(some.index, candidates)),
+        setting=lambda n: {some[k]: (1.0,) for k in n.options},
+    )
+    search._finalists = lambda beam, start, nodes: (nodes, [])
+    now = SimpleNamespace(
+        setting={some[k]: (1.0,) for k in kept}, score=Score(0.0, np.zeros(4), np.zeros(4), ())
+    )
+    judged = search._judged(SimpleNamespace(fit=fit), beam, now)
+    assert judged[0] is now and len(judged) == 1 + len(fits)
+    return fits
+
+
+def test_what_has_no_value_is_left_out_and_sets_are_looked_for_without_it(search):
+    assert limited(search, beyond=()) == [[0, 1], [2, 3]]
+    assert limited(search, beyond=(0,)) == [[0, 1], [2, 3]]  # nothing is judged twice
+    assert limited(search, beyond=(0, 3)) == [[0, 1], [2, 3], [1, 2]]
+
+
+def test_what_there_was_without_a_value_is_left_out_of_each_set(search):
+    assert limited(search, beyond=(0,), kept=(0,)) == [[0, 1], [1], [2, 3]]
 
 
 def test_what_became_nominal_is_no_finding(search):
@@ -211,10 +256,10 @@ def test_what_became_nominal_is_no_finding(search):
 
     judge = SimpleNamespace(fit=fit)
     both = SimpleNamespace(setting={friction: (0.1,), stiffness: stiffness.nominal})
-    assert identification.changing(judge, both).setting == {friction: (0.1,)}
+    assert changing(judge, both).setting == {friction: (0.1,)}
     assert asked == [({friction: (0.1,)}, 0)]
     kept = SimpleNamespace(setting={friction: (0.1,)})
-    assert identification.changing(judge, kept) is kept and len(asked) == 1
+    assert changing(judge, kept) is kept and len(asked) == 1
 
 
 def leaves(search, names, loss, angle):
@@ -256,7 +301,13 @@ def test_a_search_that_leaves_something_begins_again_where_something_else_was_le
 
 @pytest.mark.parametrize(
     "loss, settled, better",
-    [(-1.2, True, True), (-1.05, True, False), (-1.2, False, False), (-1.2, None, False)],
+    [
+        (-1.2, True, True),
+        (-1.05, True, False),
+        (-0.9, True, False),
+        (-1.2, False, False),
+        (-1.2, None, False),
+    ],
 )
 def test_another_end_is_taken_where_it_is_better_and_earned(
     search, monkeypatch, loss, settled, better
@@ -279,7 +330,11 @@ def test_rounds_begun_elsewhere_go_on_only_where_they_are_better(search, monkeyp
     best, asked = fitted(search, ["armature"], -1.0), []
     monkeypatch.setattr(search, "_begin", lambda *given: None)
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
-    round_of = lambda setting, judge: (asked.append(setting) or best, len(asked) < 2)
+
+    def round_of(setting, judge, most):
+        asked.append((setting, most))
+        return best, len(asked) < 2
+
     monkeypatch.setattr(search, "_round", round_of)
     rival = fitted(search, ["coulomb_friction"], 0.0)
     judge = SimpleNamespace(fit=lambda setting: rival)
@@ -292,7 +347,8 @@ def test_rounds_begun_elsewhere_go_on_only_where_they_are_better(search, monkeyp
         rival.loss = loss
         asked.clear()
         found = search._rounds({}, "located", "first", rival=given)
-        assert asked == [{}, best.setting][:rounds] and found.fitted is best
+        most = loss if given else np.inf
+        assert asked == [({}, most), (best.setting, most)][:rounds] and found.fitted is best
         assert found.trajectory == ["located", "moved"][rounds - 1]
 
 

@@ -23,7 +23,7 @@ class Named:
 DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)
 
 
-def chosen(monkeypatch, fitted, losses, sensors=()):
+def chosen(monkeypatch, fitted, losses, sensors=(), asked=None):
     """(setting's names, {name: names of others}) after classes; losses: {name: unpriced loss} of
     sets of one effect."""
     names = {c.name: c for c in (DRY, CURVED)}
@@ -44,10 +44,12 @@ def chosen(monkeypatch, fitted, losses, sensors=()):
     lacks = [Score(size, np.full(4, size), np.full(4, 4 * size), ()) for size in (1.0, 0.0)]
     silent = SimpleNamespace(scores=lambda *settings: lacks if sensors else None, chain=chain)
     monkeypatch.setattr(rivals, "_near", lambda *args: [])
+    held = SimpleNamespace(setting=None)
+    monkeypatch.setattr(rivals, "_along", lambda *args: held)
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
     monkeypatch.setattr(rivals, "_late", lambda *args: [])
     start = Judge().fit({names[fitted]: (2.0,)})
-    found, told = rivals.classes([DRY, CURVED], Judge(), silent, start, None)
+    found, told = rivals.classes([DRY, CURVED], Judge(), silent, start, None, asked)
     return [c.name for c in found.setting], {
         c.name: [o.name for o, _ in each] for c, each in told.items()
     }
@@ -70,6 +72,12 @@ def test_the_best_for_its_price_stands_and_what_predicts_as_well_is_told(
 ):
     found, told = chosen(monkeypatch, fitted, losses)
     assert found == [name] and told[name] == others
+
+
+def test_only_the_classes_that_are_asked_are_told(monkeypatch):
+    close = {"stribeck": 0.0, "coulomb": 0.2}
+    assert chosen(monkeypatch, "stribeck", close, asked=[]) == (["stribeck"], {})
+    assert chosen(monkeypatch, "stribeck", close, asked=[CURVED])[0] == ["coulomb"]
 
 
 def test_forces_speak_against_no_sensor(monkeypatch):
@@ -95,7 +103,7 @@ def test_the_same_effect_in_a_like_place_is_tried_at_the_findings_own_value(monk
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: None)
     before = SimpleNamespace(chain=SimpleNamespace(world=None))
     fitted = SimpleNamespace(setting={foot: (220.0,)})
-    rivals._members([], judge, before, fitted, foot)
+    rivals._members([], judge, before, fitted, foot, None)
     assert begun == [{ground: (220.0,)}, {other: (5.0,)}]
 
 
