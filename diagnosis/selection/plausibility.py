@@ -191,8 +191,8 @@ class Usual:
             return self.unit("used", candidate)
         told = asked(model, i, *self.motion, np.concatenate([r.ctrl for r in self.recordings]))
         nominal, gear = model.actuator_gainprm[i, 0] * told, model.actuator_gear[i, 0]
-        given = nominal + self.lacking[:, d] / gear
-        return max(np.nanquantile(abs(given), 0.995), 1e-9)
+        gave = nominal + self.lacking[:, d] / gear
+        return max(np.nanquantile(abs(gave), 0.995), 1e-9)
 
     def _times(self, curve):
         """RMS of what a curve is multiplied by."""

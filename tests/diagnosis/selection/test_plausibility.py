@@ -114,3 +114,18 @@ def test_what_is_usual_is_told_by_the_smoothed_motion():
     assert usual.speed == pytest.approx([0.25]) and usual.range == pytest.approx([0.0], abs=1e-8)
     damping = world.candidate("viscous_damping", "pivot")
     assert plausible(damping, usual).high == pytest.approx([5 * 0.5 / 0.25])
+
+
+@pytest.mark.parametrize("servo", [False, True])
+def test_a_servo_saturates_beside_what_it_gave_and_a_motor_beside_what_it_was_asked_for(servo):
+    """Of a servo that gives a tenth of what its law asks for, the rest is missing."""
+    spec = mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5))
+    if servo:
+        spec.actuator("drive").set_to_position(kp=50.0, kv=2.0)
+    world, run = World(spec), recorded("run.csv", 0)
+    qpos, qvel = np.random.default_rng(0).normal(size=(2, *run.ctrl.shape))
+    law = 50 * (run.ctrl - qpos) - 2 * qvel if servo else run.ctrl
+    usual = Usual(world, [run], np.ones(1), motion=(qpos, qvel), lacking=-0.9 * law)
+    low = plausible(world.candidate("saturation", "drive"), usual).low[0]
+    most = np.quantile(abs(law), 0.995)
+    assert low == pytest.approx(0.05 * most * (0.1 if servo else 1.0))
