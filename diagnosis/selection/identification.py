@@ -180,7 +180,7 @@ class Identification:
         judged = self._judged(judge, beam, now)
         if self.judged is None:
             bare = [f for f in judged if f.settled and not physics(f.setting) - set(setting)]
-            least = min(bare, key=lambda f: f.loss)
+            least = min([now, *bare], key=lambda f: f.loss)
             self.judged = [f for f in judged if f.settled and self.earned(least, f)]
         best = self._choose(judged, now)
         if best.score.loss >= most:
