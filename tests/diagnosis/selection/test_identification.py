@@ -385,7 +385,7 @@ class Located:
     position_noise = scale = noise = None
 
     def locate(self, *given, **how):
-        return SimpleNamespace(located=lambda: [None], qpos=None, qvel=None)
+        return SimpleNamespace(located=lambda: [None], qpos=None, qvel=None, force=None)
 
 
 def test_what_finer_steps_explain_as_well_is_no_physics(search, monkeypatch):
