@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+ROUNDING = 1e-12  # of a predicted variance, below which nothing is told of what it is added to
+
 
 @dataclass(frozen=True)
 class Smoothed:
@@ -89,6 +91,7 @@ def _forward(A, c, Q, y, known, R, start, spread):
     for t in range(T):
         xs[t], Ps[t] = x, P
         Fs[t] = np.where(pair[t], P[:, :m, :m] + noise, np.eye(m))
+        Fs[t][:, range(m), range(m)] *= 1 + ROUNDING
         inverses[t] = np.linalg.inv(Fs[t])
         errors[t] = (y[t] - x[:, :m]) * known[t]
         gains[t] = P[:, :, :m] @ (inverses[t] * pair[t])

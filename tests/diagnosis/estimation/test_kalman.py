@@ -83,3 +83,14 @@ def test_of_the_noise_only_rows_that_count_are_asked(problem):
         assert (parts[0].measurement[k] < whole.measurement[k]).all()
     for part in parts:
         np.testing.assert_array_equal(part.state, whole.state)
+
+
+def test_what_two_readings_share_may_be_far_larger_than_what_they_do_not():
+    """A motion that runs away where nothing is read moves both by as much: their covariance is
+    singular but for rounding."""
+    A = np.broadcast_to([[1.0, 0.0], [1.0, 0.0]], (2, 1, 2, 2))
+    y = np.array([[[np.nan, np.nan]], [[3.0, 3.0]]])
+    none, small = np.zeros((2, 1, 2)), np.full((2, 1, 2), 1e-6)
+    found = smooth(A, none, small, y, np.full(2, 1e-6), np.zeros((1, 2)), np.full((1, 2), 1e20))
+    assert found.state[1, 0] == pytest.approx([3.0, 3.0], abs=1e-3)
+    assert np.isfinite(found.variance).all() and np.isfinite(found.likelihood)
