@@ -38,6 +38,11 @@ class ActuatorEffect(Effect):
         ] in (HINGE, SLIDE)
 
     @staticmethod
+    def servo(model, i):
+        """Whether its force depends on where it is, or how fast."""
+        return model.actuator_biasprm[i, 1:3].any()
+
+    @staticmethod
     def strength(model, i):
         """A typical force of the actuator."""
         if model.actuator_forcelimited[i]:

@@ -99,42 +99,38 @@ class DeadZone(ActuatorEffect):
     acts_through = "control"
 
     def fits(self, model, i):
-        motor = model.actuator_gainprm[i, 0] and not self._servo(model, i)
+        motor = model.actuator_gainprm[i, 0] and not self.servo(model, i)
         return super().fits(model, i) and (
             motor
             or self.on_joint(model, i)
             and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
         )
 
-    @staticmethod
-    def _servo(model, i):
-        return model.actuator_biasprm[i, 1:3].any()
-
     def parameters(self, model, i):
         F = self.strength(model, i)
-        if self._servo(model, i):
+        if self.servo(model, i):
             return (Parameter("half_width", self.unit(model, i), 0.0, 0.0, HUGE * F, 0.005 * F),)
         u = F / abs(model.actuator_gainprm[i, 0])
         return (Parameter("half_width", "control", 0.0, 0.0, HUGE * u, 0.01 * u),)
 
     def probes(self, model, i, recordings):
         used = np.quantile(self.forces(model, i, recordings), 0.9)
-        unit = 1.0 if self._servo(model, i) else abs(model.actuator_gainprm[i, 0])
+        unit = 1.0 if self.servo(model, i) else abs(model.actuator_gainprm[i, 0])
         return used / unit * np.array([[0.03], [0.1], [0.3]]) if used > 0 else np.zeros((0, 1))
 
     def command(self, signal, model, i, values):
-        if self._servo(model, i):
+        if self.servo(model, i):
             return signal
         return replace(
             signal, value=np.sign(signal.value) * np.maximum(abs(signal.value) - values[0], 0.0)
         )
 
     def stepwise(self, model, i):
-        return bool(self._servo(model, i))
+        return bool(self.servo(model, i))
 
     def force(self, models, i, values):
         model = models[0]
-        if not self._servo(model, i):
+        if not self.servo(model, i):
             return None
 
         def absorbed(force, qvel, time):
@@ -147,7 +143,7 @@ class DeadZone(ActuatorEffect):
         return "python"
 
     def part(self, model, i, values):
-        law = "dead_zone_of_force" if self._servo(model, i) else "dead_zone"
+        law = "dead_zone_of_force" if self.servo(model, i) else "dead_zone"
         return Part(law, model.actuator(i).name, {"half_width": float(values[0])})
 
 

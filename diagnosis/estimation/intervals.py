@@ -57,10 +57,9 @@ def without_step(fitted, index):
     stack = np.concatenate([columns.array[..., index], change[..., None]], -1)
     kind = type(fitted.evidence)  # of a layer above this one
     evidence = kind(columns.ahead, columns.residual, stack)
-    every, none = np.arange(p + 1), np.zeros(p + 1)
+    every = np.arange(p + 1)
     wide, amounts = half_widths(evidence, every)
-    products = evidence.freed(every, none)
-    weight = evidence.weighed(evidence.square_of(products, none))
+    products, weight = _weighted(evidence, every)
     whole = products.weighed(weight).sum(0)[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     even = whole / np.outer(scale, scale)
@@ -80,8 +79,7 @@ def half_widths(evidence, index):
     p = len(index)
     if not p:
         return np.zeros(0), np.zeros(0)
-    products = evidence.freed(index, np.zeros(p))
-    weight = evidence.weighed(evidence.square_of(products, np.zeros(p)))
+    products, weight = _weighted(evidence, index)
     each = products.weighed(weight)
     scale = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], 1e-300))
     gram, score = each[:, 1:, 1:] / np.outer(scale, scale), each[:, 1:, 0] / scale
@@ -112,6 +110,13 @@ def half_widths(evidence, index):
     half = t_ppf(0.975, freedom) * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     half[unseen] = np.inf
     return half / scale, moves / scale
+
+
+def _weighted(evidence, index):
+    """(Products of columns index (p,), start states free; weights (G, cells)), amounts zero."""
+    none = np.zeros(len(index))
+    products = evidence.freed(index, none)
+    return products, evidence.weighed(evidence.square_of(products, none))
 
 
 def _curvature(slopes, weight, root):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-ROUNDING = 1e-12  # of a predicted variance, below which nothing is told of what it is added to
+ROUNDING = 1e-12  # share added to variances: noise far smaller than these would be rounded away
 
 
 @dataclass(frozen=True)

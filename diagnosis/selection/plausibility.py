@@ -160,8 +160,7 @@ class Usual:
         if kind == "used" or (kind == "force" and place.kind == "actuator" and d is None):
             i = model.actuator(place.name).id
             used = np.quantile(ActuatorEffect.forces(model, i, self.recordings), 0.995)
-            servo = model.actuator_biasprm[i, 1:3].any()
-            motor = candidate.effect.name == "dead_zone" and not servo
+            motor = candidate.effect.name == "dead_zone" and not ActuatorEffect.servo(model, i)
             return max(used, 1e-9) / (abs(model.actuator_gainprm[i, 0]) if motor else 1.0)
         if kind == "given":
             return self._given(candidate)
@@ -187,11 +186,10 @@ class Usual:
         its error, so of that what the motion needed; of a motor, what was asked for."""
         model, d = self.model, self.dof(candidate.place)
         i = model.actuator(candidate.place.name).id
-        if d is None or self.lacking is None or not model.actuator_biasprm[i, 1:3].any():
+        if d is None or self.lacking is None or not ActuatorEffect.servo(model, i):
             return self.unit("used", candidate)
-        told = asked(model, i, *self.motion, np.concatenate([r.ctrl for r in self.recordings]))
-        nominal, gear = model.actuator_gainprm[i, 0] * told, model.actuator_gear[i, 0]
-        gave = nominal + self.lacking[:, d] / gear
+        nominal = model.actuator_gainprm[i, 0] * self._asked(i)
+        gave = nominal + self.lacking[:, d] / model.actuator_gear[i, 0]
         return max(np.nanquantile(abs(gave), 0.995), 1e-9)
 
     def _times(self, curve):
@@ -201,9 +199,12 @@ class Usual:
             return self.speed[self.model.joint(name).dofadr[0]]
         if kind != "control":
             return 1.0
+        return np.sqrt(np.nanmean(self._asked(self.model.actuator(name).id) ** 2)) + 1e-9
+
+    def _asked(self, i):
+        """(n,) what an actuator is asked for along the motion."""
         ctrl = np.concatenate([r.ctrl for r in self.recordings])
-        told = asked(self.model, self.model.actuator(name).id, *self.motion, ctrl)
-        return np.sqrt(np.nanmean(told**2)) + 1e-9
+        return asked(self.model, i, *self.motion, ctrl)
 
 
 def plausible(candidate, usual):

@@ -1,7 +1,7 @@
 """Sums of products of columns, per group of windows and cell, from which start states take their
 share: what hypotheses are worked out from.
 
-sums = Sums(rows, shape, group)
+sums = Sums(rows, counted, group, width)
 products = sums.of(index).freed(square, floor)         # of columns index (..., p)
 products.squares(amounts), products.weighed(weight)
 """
@@ -24,7 +24,7 @@ class Sums:
     def __init__(self, rows, counted, group, width):
         """rows {(window, cell): (n, K + m)}, columns first; counted (W, cells): how many; group
         (G, W): which windows belong to each; width: K."""
-        where, self.rows, self.group = sorted(rows), counted, group
+        where, self.rows, self.group = sorted(rows), counted, group.astype(float)
         self.shape, self.group_of = counted.shape, group.argmax(0)
         every = np.concatenate([rows[k] for k in where]).T if rows else np.zeros((width, 0))
         lengths = [len(rows[k]) for k in where]
@@ -68,9 +68,14 @@ class Sums:
         new = np.triu((asked | asked.T) & ~self._known)
         for i in np.flatnonzero(new.any(1)):
             j = np.flatnonzero(new[i])
-            each = self.group.astype(float) @ self.sum(self.columns[j] * self.columns[i])
+            each = self.group @ self.sum(self.columns[j] * self.columns[i])
             self._products[i, j] = self._products[j, i] = each
             self._known[i, j] = self._known[j, i] = True
+
+    def beside(self, crossed, moved):
+        """(..., W, cells, m): products with the starts that are left of some (..., W, cells, m)
+        where start states are moved (..., W, m)."""
+        return crossed - (self.starts @ moved[..., None, :, None])[..., 0]
 
     def moved(self, crossed, square, floor):
         """(..., W, m, p): how many standard deviations start states follow columns, from their
@@ -110,16 +115,16 @@ class Products:
             z = z if z.shape[-2] == 1 else z[..., self.sums.group_of, :]
             crossed = (self.crossed @ z[..., None, :, None])[..., 0]  # (..., W, cells, m)
             moved = (self.moved @ z[..., None])[..., 0]  # (..., W, m)
-            rest = crossed - (self.sums.starts @ moved[..., None, :, None])[..., 0]
-            out -= self.sums.group.astype(float) @ ((crossed + rest) @ moved[..., None])[..., 0]
+            rest = self.sums.beside(crossed, moved)
+            out -= self.sums.group @ ((crossed + rest) @ moved[..., None])[..., 0]
         return np.maximum(out, 0.0)
 
     def slopes(self):
         """Products (..., G, cells, p - 1) of the residual with the other columns."""
         moved, crossed = self.moved[..., 0], self.crossed[..., 0]
-        rest = crossed - (self.sums.starts @ moved[..., None, :, None])[..., 0]
+        rest = self.sums.beside(crossed, moved)
         taken = (moved[..., None, None, :] @ self.crossed)[..., 0, :] + rest @ self.moved
-        taken = np.einsum("gw,...wcp->...gcp", self.sums.group.astype(float), taken)
+        taken = np.einsum("gw,...wcp->...gcp", self.sums.group, taken)
         return (self.grouped[..., 0, :] - taken)[..., 1:]
 
     def weighed(self, weight):
@@ -132,4 +137,4 @@ class Products:
         starts = np.einsum("...wc,wcij->...wij", weight, self.sums.starts)
         shared = np.swapaxes(crossed - starts @ self.moved / 2, -1, -2) @ self.moved
         taken = shared + np.swapaxes(shared, -1, -2)
-        return out - np.einsum("gw,...wij->...gij", self.sums.group.astype(float), taken)
+        return out - np.einsum("gw,...wij->...gij", self.sums.group, taken)
