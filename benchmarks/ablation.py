@@ -59,6 +59,8 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "what is left may scatter as it likes": {"diagnosis.selection.unmodelled_force:ABOVE": 0.0},
     "not begun elsewhere": {"diagnosis.selection.identification:ELSEWHERE": 0},
     "no single effects beside the finalists": {"diagnosis.selection.identification:ALONE": 0},
+    "what touches is told by positions as they are": {"diagnosis.estimation.smoother:REACH": 0.0},
+    "three tones": {"diagnosis.effects.transmissions:TONES": (4.0, 8.0, 16.0)},
     "one horizon": {"diagnosis.estimation.ahead:HORIZONS": (1.0,)},
 }
 COLUMNS = (

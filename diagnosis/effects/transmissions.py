@@ -35,7 +35,7 @@ RELAXES, FASTEST = (
     10.0,
 )  # Runge-Kutta's limit of a decay per step; the speed in rad/s or m/s at which it has to hold
 BENDS = 0.02, 0.07  # share of the travel in which a bristle yields, to try first
-TONES = 4.0, 8.0, 16.0  # Hz of an elastic joint, to try first
+TONES = 2.0, 2.8, 4.0, 5.7, 8.0, 11.3, 16.0  # Hz of an elastic joint, to try first
 DAMPED = 0.1  # its damping ratio
 
 

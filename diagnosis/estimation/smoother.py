@@ -15,18 +15,18 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from diagnosis.effects.base import HINGE, SLIDE
-from diagnosis.effects.environment import touchable
 from diagnosis.estimation import windowing
 from diagnosis.estimation.kalman import smooth
 from diagnosis.estimation.noise import measurement_noise
 from diagnosis.estimation.readings import behind, later, shown
+from diagnosis.estimation.touching import touching
 from diagnosis.simulation.rows import RowMap
 
 BLOCK = 200  # rows that are smoothed as one piece
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
 MOST = 10.0  # factor of a variance in one update
 LOUDER = 20.0  # noise is at most so many times what differences of readings show
+REACH = 2.0  # deviations of a position, within which something may touch
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
 
 
@@ -164,8 +164,9 @@ class Smoother:
         off = self.model, setting, self.recordings
         qpos, qvel = behind(*off, qpos, qvel)
         seen = self._seen(off)
+        apart = np.sqrt(self.R[: self.model.nv]) if trajectory is None else trajectory.qpos_sd
         for _ in range(passes):
-            free = self._touching(qpos)
+            free = touching(self.model, qpos, REACH * apart)
             step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
             for _ in range(UPDATES):
                 found = self._smooth(step, qpos, qvel, seen, ~free)
@@ -177,6 +178,7 @@ class Smoother:
                 found.state[live],
                 np.sqrt(found.variance[live]),
             )
+            apart = deviation[:, :nv]
             qpos = windowing.integrate(self.model, qpos, state[:, :nv])
             qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
         qpos, qvel = shown(*off, qpos, qvel)
@@ -193,23 +195,6 @@ class Smoother:
         what the recordings show."""
         qpos, qvel = behind(*off, self.qpos, self.qvel)
         return qpos, qvel, later(*off, self.position), later(*off, self.velocity)
-
-    def _touching(self, qpos):
-        """Rows (N,) at or after which something touches, or lies at the end of its travel; a force
-        there is told by no smooth map."""
-        model = self.model
-        ends = (model.jnt_limited != 0) & np.isin(model.jnt_type, (HINGE, SLIDE))
-        at, (low, high) = qpos[:, model.jnt_qposadr[ends]], model.jnt_range[ends].T
-        touch = ((at < low) | (at > high)).any(1)
-        if model.nflex or any(touchable(model, i).any() for i in range(model.ngeom)):
-            data = mujoco.MjData(model)
-            for row, q in enumerate(qpos):
-                data.qpos[:] = q
-                mujoco.mj_kinematics(model, data)
-                mujoco.mj_comPos(model, data)
-                mujoco.mj_collision(model, data)
-                touch[row] |= data.ncon > 0
-        return touch | np.append(touch[1:], False)
 
     def _linear(self, rows, qpos, qvel, force, free, like=None):
         """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a

@@ -108,6 +108,25 @@ def test_of_a_candidate_the_best_share_and_the_best_whole_value_are_kept(scene):
     assert [start.whole for start in sorted(kept, key=lambda s: s.whole)] == [False, True]
 
 
+def test_whole_values_are_looked_at_within_their_bounds(monkeypatch):
+    """A sensor is late by three rows: thirty times a delay of a tenth of a row would do as well in
+    a picture that is linear, but no delay acts in proportion that far."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded(f"{k}.csv", k) for k in (0, 1)]
+    late = lambda r: replace(r, qpos=np.concatenate([r.qpos[:1]] * 3 + [r.qpos[:-3]]))
+    runs = [late(run) for run in runs]
+    smoother, seconds = Smoother(world, runs), float(3 * np.diff(runs[0].time[:2])[0])
+    chain = Chain(world, cut_ahead(runs), np.array([NOISE]))
+    chain.start(smoother.locate({}))
+    candidate = world.candidate("sensor_delay", "pivot")
+    prior = plausible(candidate, Usual(world, runs, smoother.scale))
+    bounds = np.array([0.3]), np.array([3.0])
+    whole = lambda x: Start(candidate, np.zeros(1), np.array([[x]]), *bounds, prior)
+    near, tiny = whole(0.8 * seconds), whole(seconds / 30)
+    monkeypatch.setattr(first_look, "MORE", 0)
+    assert likely(MissingForce(chain, {}), [tiny, near]) == [near]
+
+
 def test_a_look_at_all_starts_keeps_those_of_the_setting(scene, monkeypatch):
     world, chain, usual = scene
     monkeypatch.setattr(first_look, "EACH", 1)
