@@ -140,6 +140,12 @@ def touchable(model, i):
     return meets & (not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT))
 
 
+def collides(model):
+    """Whether anything in a model can touch."""
+    geoms = any(touchable(model, i).any() for i in range(model.ngeom))
+    return bool(model.npair or model.nflex or geoms)
+
+
 class ContactEffect(Effect):
     """An effect on all contacts of one geom, which gets priority over its partners.
 

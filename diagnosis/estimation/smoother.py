@@ -164,9 +164,9 @@ class Smoother:
         off = self.model, setting, self.recordings
         qpos, qvel = behind(*off, qpos, qvel)
         seen = self._seen(off)
-        apart = np.sqrt(self.R[: self.model.nv]) if trajectory is None else trajectory.qpos_sd
+        qpos_sd = np.sqrt(self.R[: self.model.nv]) if trajectory is None else trajectory.qpos_sd
         for _ in range(passes):
-            free = touching(self.model, qpos, REACH * apart)
+            free = touching(self.model, qpos, REACH * qpos_sd)
             step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
             for _ in range(UPDATES):
                 found = self._smooth(step, qpos, qvel, seen, ~free)
@@ -178,7 +178,7 @@ class Smoother:
                 found.state[live],
                 np.sqrt(found.variance[live]),
             )
-            apart = deviation[:, :nv]
+            qpos_sd = deviation[:, :nv]
             qpos = windowing.integrate(self.model, qpos, state[:, :nv])
             qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
         qpos, qvel = shown(*off, qpos, qvel)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.effects.base import HINGE, SLIDE
-from diagnosis.effects.environment import touchable
+from diagnosis.effects.environment import collides
 
 
 def touching(model, qpos, reach):
@@ -22,16 +22,17 @@ def touching(model, qpos, reach):
     at, off = qpos[:, model.jnt_qposadr[ends]], reach[:, model.jnt_dofadr[ends]]
     low, high = model.jnt_range[ends].T
     touch = ((at < low + off) | (at > high - off)).any(1)
-    if model.nflex or any(touchable(model, i).any() for i in range(model.ngeom)):
+    if collides(model):
         touch |= _near(model, qpos, reach)
     return touch | np.append(touch[1:], False)
 
 
 def _near(model, qpos, reach):
-    """Rows (N,) in which two geoms are no farther apart than their distance may be off."""
+    """Rows (N,) in which a contact may be made, as far as its distance is known."""
     wide = copy(model)  # which finds contacts before they are made
     most = np.linalg.norm(reach, axis=1).max(initial=0.0) * max(model.stat.extent, 1.0)
-    wide.geom_margin[:] += most
+    wide.geom_margin[:] += most / 2  # those of two that touch are summed
+    wide.flex_margin[:] += most / 2
     wide.pair_margin[:] += most
     data, out = mujoco.MjData(wide), np.zeros(len(qpos), bool)
     for row, (q, off) in enumerate(zip(qpos, reach)):
@@ -39,17 +40,18 @@ def _near(model, qpos, reach):
         mujoco.mj_kinematics(wide, data)
         mujoco.mj_comPos(wide, data)
         mujoco.mj_collision(wide, data)
-        out[row] = any(c.dist < _within(model, data, c, off) for c in data.contact)
+        gaps = ((c, c.dist - c.includemargin + most) for c in data.contact)
+        out[row] = any(gap < _off(model, data, c, off) for c, gap in gaps)
     return out
 
 
-def _within(model, data, contact, reach):
-    """The distance, m, below which a contact may be made where coordinates are off by reach (nv,),
-    independently; 0 of flexible ones."""
+def _off(model, data, contact, reach):
+    """How far a contact's distance, m, may be off where coordinates are by reach (nv,),
+    independently; 0 of flexible bodies."""
     if min(contact.geom) < 0:
         return 0.0
     slope, jacobian = np.zeros(model.nv), np.empty((3, model.nv))
     for sign, body in zip((-1.0, 1.0), model.geom_bodyid[contact.geom]):
         mujoco.mj_jac(model, data, jacobian, None, contact.pos, body)
         slope += sign * contact.frame[:3] @ jacobian
-    return model.geom_margin[contact.geom].sum() + float(np.linalg.norm(slope * reach))
+    return float(np.linalg.norm(slope * reach))

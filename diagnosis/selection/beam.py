@@ -144,9 +144,8 @@ class Beam:
             return start
         best, grown = None, [self.node(start.options, self.missing)]
         while grown and (best is None or grown[0].loss < best.loss - LEAST):
-            best, held = grown[0], self._candidates(grown[0])
-            others = [k for k in self.free if self.columns.options[k].candidate not in held]
-            named = [k for k in others if not self._unnamed(k)]
+            best = grown[0]
+            named = [k for k in self.others(best) if not self._unnamed(k)]
             grown = self.nodes_of([(*best.options, k) for k in named], self.missing)
             grown.sort(key=lambda n: n.loss)
         return self.node(best.options)
@@ -180,13 +179,16 @@ class Beam:
                 break
             node = less
 
+    def others(self, node):
+        """Indices of the options of effects that a node does not hold."""
+        options, held = self.columns.options, self._candidates(node)
+        return [k for k in self.free if options[k].candidate not in held]
+
     def gains(self, node):
         """{k: nats} that options of effects which a node does not hold promise, in a first look."""
         index, *_, precision, _ = problem(self.columns, node.options)
         gain = self.evidence.looks(index, node.score.amounts, precision)
-        options, held = self.columns.options, self._candidates(node)
-        others = [k for k in self.free if options[k].candidate not in held]
-        return {k: gain[list(options[k].columns)].sum() for k in others}
+        return {k: gain[list(self.columns.options[k].columns)].sum() for k in self.others(node)}
 
     def _looks(self, node):
         """Indices of the further options that promise most for their price in a first look."""

@@ -72,8 +72,7 @@ def _by_windows(short, setting, inside, starts, rounds):
     beam = Beam(columns, columns.evidence())
     node, kept = beam.node(beam.kept), {}
     for _ in range(rounds):
-        held = {columns.options[k].candidate for k in node.options}
-        others = [k for k in beam.free if columns.options[k].candidate not in held]
+        others = beam.others(node)
         # within the bounds of their amounts: a column tells of no values far from its own
         grown = beam.nodes_of([(*node.options, k) for k in others])
         gains = {columns.begun[k]: node.unpriced - new.unpriced for k, new in zip(others, grown)}

@@ -9,7 +9,7 @@ import numpy as np
 
 from diagnosis.effects.actuators import nominal_delay
 from diagnosis.effects.base import runge_kutta
-from diagnosis.effects.environment import touchable
+from diagnosis.effects.environment import collides
 from diagnosis.simulation.control_signal import SLACK, Signal
 
 COPY_BYTES = 50e6  # of edited models, and of sampled controls, kept for the next call
@@ -62,7 +62,7 @@ class Working:
             )
         self.model = m = spec.compile()
         idle = mujoco.mjtDisableBit.mjDSBL_ISLAND if m.ntree < 2 else 0
-        if not (m.npair or m.nflex or any(touchable(m, i).any() for i in range(m.ngeom))):
+        if not collides(m):
             idle |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         m.opt.disableflags |= int(idle)  # what there is nothing to do for still takes its time
         self.q, self.v = [], []

@@ -56,6 +56,21 @@ def test_what_may_touch_is_told_by_how_far_the_distance_may_be_off(margin):
         assert touch.tolist() == [side < 0, False]
 
 
+PAIRED = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
+  <geom name="floor" type="plane" size="5 5 .1"/><body pos="0 0 .05">
+  <joint type="slide" axis="0 0 1"/><geom name="ball" size=".05" mass="1"/></body></worldbody>
+  <contact><pair geom1="floor" geom2="ball" margin="0.02"/></contact></mujoco>"""
+
+
+def test_of_a_pair_its_own_margin_counts():
+    """Its geoms collide with nothing else, and have no margin of their own."""
+    model = mujoco.MjModel.from_xml_string(PAIRED)
+    for off in (0.0, 0.004):
+        at = 0.02 + off
+        qpos = np.array([[at - 1e-4], [1.0], [at + 1e-4]])
+        assert touching(model, qpos, np.array([off])).tolist() == [True, False, False]
+
+
 def test_a_joint_at_the_end_of_its_travel_as_far_as_it_is_known():
     model = mujoco.MjModel.from_xml_string(ROD.format(margin=0.0))
     end = -np.pi / 2
