@@ -35,7 +35,7 @@ class Unknown(JointEffect):
     'speed:<joint>' for its size. wave: a sine through two knots, a quarter of its period apart.
     """
 
-    name, kind, simplicity = "unknown", "joint", 3
+    name, kind, simplicity = "unknown", "joint", 4
 
     def __init__(self, variable, knots, factor=None, wave=False):
         self.variable, self.knots, self.factor, self.wave = (

@@ -11,12 +11,15 @@ from the same measured state, and both run on through the same linear transition
 is the missing one they are equal, whatever its size.
 """
 
+import mujoco
 import numpy as np
 
 from diagnosis.estimation import windowing
-from diagnosis.estimation.ahead import Ahead, with_own_step
+from diagnosis.estimation.ahead import GROUPS, Ahead, with_own_step
 from diagnosis.simulation.rows import RowMap, coarse
 
+GROUPED = 19  # rows in each group, in which forces are compared
+OUTSIDE = 0.1  # share of a located force that may hang by rows outside of the windows
 ASTRAY = 1e3  # times its travel, to where a chain of transitions at stiff stops may run away
 
 
@@ -45,14 +48,17 @@ class Chain(Ahead):
             near = abs(self._carried_starts()) < ASTRAY * self.whole.travel[:, None]
         touched |= ~near.all((1, 2, 3))
         self.carried, self.touched = follows & ~touched[:, None], np.flatnonzero(touched)
-        self.used = np.unique(self.rows[:, :-1][self.carried])
+        told = ~trajectory.free & trajectory.driven.any((1, 2))
+        self.used = self.begin[told[self.begin]]
         beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
         self.beside = np.where(self.known, beside, 0.0)
         # columns are differences: what a coarse step does wrong it does with an effect and without
         step = {c: v for c, v in self.base.items() if c.effect.numerical}
         self.coarse, self.base = coarse(self.world, trajectory.first), self.plain(self.base)
         rough = self._rows({**self.coarse, **self.base}, self.begin)
+        self.inertia = self.map.model
         self.finer, self.beyond = self._rows({**step, **self.base}, self.begin) - rough, {}
+        self.told, self.located = None, {}
         self.contacts = self._begun([self.windows[i] for i in self.touched], touching)
         self.travel = np.where(touched[:, None, None], self.whole.travel, np.inf)
 
@@ -85,7 +91,7 @@ class Chain(Ahead):
 
     def _predicted(self, settings, simulated):
         out = np.zeros((len(settings), *self.known.shape))
-        if len(self.used):
+        if self.carried.any():
             plain = [self.plain(s) for s in settings]
             self._along(plain, out)
             self._beyond(settings, plain, out)
@@ -114,14 +120,53 @@ class Chain(Ahead):
             out[:, t + 1] = np.where(self.known[:, t + 1, :, None], x[:, :nv], 0.0)
         return out
 
+    def telling(self):
+        """Rows in which located forces are compared: from now on they are worked out along with
+        every prediction."""
+        if self.told is None:
+            self.told, self.inside = self._told(), self.missing(self.base, self.used)
+        return self.told
+
+    def _told(self):
+        """Rows whose located force hangs by what happens in the rows used, evenly chosen."""
+        t = self.trajectory
+        outside = ~t.free
+        outside[self.begin] = False
+        beyond = np.where(outside[:, None, None], t.driven, 0.0)
+        near = abs(t.response(beyond)[self.used]).max((1, 2), initial=0.0) if outside.any() else 0.0
+        some = self.used[near < OUTSIDE]
+        return some[windowing.evenly(len(some), GROUPS * GROUPED)]
+
     def _along(self, settings, out):
         """Fill in what the chain predicts, the same once."""
-        done = {}
-        for row, setting in zip(out, settings):
-            key = frozenset(setting.items())
-            if key not in done:
-                done[key] = self._grown(self.missing(setting, self.used))
-            row[:] = done[key]
+        done, keys = {}, [frozenset(setting.items()) for setting in settings]
+        for key, setting in zip(keys, settings):
+            done[key] = done[key] if key in done else self.missing(setting, self.used)
+        if self.told is not None:
+            self._locate({key: m for key, m in done.items() if key not in self.located})
+        grown = {key: self._grown(missing) for key, missing in done.items()}
+        for row, key in zip(out, keys):
+            row[:] = grown[key]
+
+    def _locate(self, every):
+        """Remember what smoothing would locate of {key: what is missing in the rows used}."""
+        if not every:
+            return
+        t = self.trajectory
+        less = np.stack([*every.values()], -1) - self.inside[..., None]
+        change = np.zeros((len(t.qvel), *less.shape[1:]), np.float32)
+        change[self.used] = np.where(np.isfinite(less), less, 0.0)
+        force = t.force[self.told][..., None] + t.response(change)[self.told]
+        self.located |= dict(zip(every, np.moveaxis(force, -1, 0)))
+
+    def lacking(self, settings):
+        """[(rows, nv)]: generalized force that plain settings lack in the rows told, as the
+        smoother locates it."""
+        self.telling()
+        keys = [frozenset(setting.items()) for setting in settings]
+        new = {key: s for key, s in zip(keys, settings) if key not in self.located}
+        self._locate({key: self.missing(s, self.used) for key, s in new.items()})
+        return [self.located[key] for key in keys]
 
     def _beyond(self, settings, plain, out):
         """Add what effects do that are more than what happens within a row, beside the setting that
@@ -153,9 +198,17 @@ class Chain(Ahead):
 
     def missing(self, setting, rows):
         """(rows, 2 nv): the smoothed motion less the predicted one, a row on, of rows (n,), under
-        a plain setting."""
+        a plain setting, as forces change it in the model of the chain: these superpose."""
         found = self._rows({**self.coarse, **setting}, rows)
-        return found + self.finer[np.searchsorted(self.begin, rows)]
+        found += self.finer[np.searchsorted(self.begin, rows)]
+        model = self.map.model
+        if not _as_heavy(model, self.inertia):
+            gap, t = found[:, self.model.nv :], self.trajectory
+            more = _times_mass(model, t.qpos[rows], gap)
+            more -= _times_mass(self.inertia, t.qpos[rows], gap)
+            more /= self.map.seconds[np.searchsorted(self.map.begin, rows), None]
+            found += (t.driven[rows] @ more[..., None])[..., 0]
+        return found
 
     def _rows(self, setting, rows):
         t = self.trajectory
@@ -174,6 +227,24 @@ class Chain(Ahead):
         for t in range(T - 1):
             step = self.trajectory.transition[self.rows[:, t]]
             x = (step @ x[..., None])[..., 0] + missing[at[:, t]]
-            x *= self.carried[:, t : t + 1]
+            x = np.where(self.carried[:, t : t + 1], x, 0.0)
             out[:, t + 1] += np.where(self.known[:, t + 1], x[:, :nv], 0.0)
         return out
+
+
+INERTIAL = "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "dof_armature"
+
+
+def _as_heavy(model, other):
+    """Whether two models' inertia is the same in every position."""
+    return all(np.array_equal(getattr(model, name), getattr(other, name)) for name in INERTIAL)
+
+
+def _times_mass(model, qpos, qvel):
+    """The inertia matrices at positions qpos (n, nq) times velocities qvel (n, nv)."""
+    data, out = mujoco.MjData(model), np.empty_like(qvel)
+    for row, q, v in zip(out, qpos, qvel):
+        data.qpos[:] = q
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_mulM(model, data, row, v)
+    return out

@@ -1,8 +1,7 @@
 """A Kalman smoother over many blocks of rows at once, with the scores of its variances.
 
 Per block: x' = A x + c + noise of variance Q, y = x[:m] + noise of variance R; see Durbin and
-Koopman,
-Time Series Analysis by State Space Methods, sections 4.4 and 7.3 (disturbance smoother).
+Koopman, Time Series Analysis by State Space Methods, sections 4.4 and 7.3 (disturbance smoother).
 """
 
 from dataclasses import dataclass
@@ -13,12 +12,23 @@ ROUNDING = 1e-12  # share added to variances: noise far smaller than these would
 
 
 @dataclass(frozen=True)
+class Gains:
+    """What a smoother does with errors: onward (T, blocks, n, n), those of predicted states from
+    row to row; precision (T, blocks, m, m) of measured less predicted, 0 for what is not measured;
+    variance (T, blocks, n, n) of predicted states."""
+
+    onward: np.ndarray
+    precision: np.ndarray
+    variance: np.ndarray
+
+
+@dataclass(frozen=True)
 class Smoothed:
     """state (T, blocks, n), variance (T, blocks, n) of each component, and for the variances'
     updates:
 
     process, measurement: pairs (sum of squares, what that would be at the likelihood's optimum),
-    (n,) or (m,). likelihood: log-likelihood summed over blocks.
+    (n,) or (m,). likelihood: log-likelihood summed over blocks. gains: the Gains.
     """
 
     state: np.ndarray
@@ -26,6 +36,7 @@ class Smoothed:
     process: tuple
     measurement: tuple
     likelihood: float
+    gains: Gains
 
 
 def smooth(A, c, Q, y, R, start, spread, counts=None):
@@ -50,7 +61,8 @@ def smooth(A, c, Q, y, R, start, spread, counts=None):
     u = pushed - _times(np.swapaxes(K, -1, -2), behind)
     told = known if counts is None else known & counts[..., None]
     measurement = (u**2 * told).sum((0, 1)), (D * told).sum((0, 1))
-    return Smoothed(state, np.maximum(variance, 0.0), process, measurement, likelihood)
+    gains = Gains(A @ keep, Finv, P)
+    return Smoothed(state, np.maximum(variance, 0.0), process, measurement, likelihood, gains)
 
 
 def _backward(A, keep, pushed, P, K, Finv):

@@ -19,10 +19,11 @@ from diagnosis.estimation import windowing
 from diagnosis.estimation.kalman import smooth
 from diagnosis.estimation.noise import measurement_noise
 from diagnosis.estimation.readings import behind, later, shown
+from diagnosis.estimation.response import Response
 from diagnosis.estimation.touching import touching
 from diagnosis.simulation.rows import RowMap
 
-BLOCK = 200  # rows that are smoothed as one piece
+BLOCK, LEAD = 200, 40  # rows that are smoothed as one piece, and beside them on either side
 PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
 MOST = 10.0  # factor of a variance in one update
 LOUDER = 20.0  # noise is at most so many times what differences of readings show
@@ -39,7 +40,7 @@ class Trajectory:
     that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free
     (rows,): where something touches, and no force is told; transition (rows, 2 nv, 2 nv): to the
     next row, of small changes; step: the simulator's, s, 0 if unknown; driven (rows, 2 nv, nv): by
-    forces, None if unknown.
+    forces, None if unknown; response: the Response by which the force was located, None if unknown.
     """
 
     qpos: np.ndarray
@@ -53,6 +54,7 @@ class Trajectory:
     transition: np.ndarray
     step: float = 0.0
     driven: np.ndarray = None
+    response: Response = None
 
     def at(self, windows):
         """Start states of windows: qpos (W, nq), qvel (W, nv)."""
@@ -105,15 +107,18 @@ class Smoother:
         self.position_noise, self.velocity_noise = self._noise()
 
     def _blocks(self, starts):
-        """Cut all rows into blocks: index (rows of a block, blocks), live where a row is no
-        padding."""
+        """Cut all rows into blocks that overlap: index (rows of a block, blocks), live where a row
+        is no padding, own where it is taken from this block. What a block knows of its ends without
+        its neighbour would be a jump between the two."""
         blocks = []
         for a, b in zip(starts[:-1], starts[1:]):
             edges = np.linspace(a, b, max(1, round((b - a) / BLOCK)) + 1).astype(int)
-            blocks += list(zip(edges[:-1], edges[1:]))
-        length = max(b - a for a, b in blocks)
-        self.index = np.array([np.minimum(np.arange(a, a + length), b - 1) for a, b in blocks]).T
-        self.live = np.array([np.arange(a, a + length) < b for a, b in blocks]).T
+            ends = zip(np.maximum(edges[:-1] - LEAD, a), np.minimum(edges[1:] + LEAD, b))
+            blocks += [(*own, *whole) for own, whole in zip(zip(edges[:-1], edges[1:]), ends)]
+        first, end, begin, over = np.array(blocks).T
+        rows = begin + np.arange((over - begin).max())[:, None]
+        self.index, self.live = np.minimum(rows, over - 1), rows < over
+        self.own = (rows >= first) & (rows < end)
         self.last = np.zeros(starts[-1], bool)
         self.last[starts[1:] - 1] = True  # of a recording: nothing follows
         self.before = (
@@ -172,12 +177,10 @@ class Smoother:
                 found = self._smooth(step, qpos, qvel, seen, ~free)
                 self._update(found, ~free)
             found = self._smooth(step, qpos, qvel, seen, ~free)
-            nv, live = self.model.nv, self.live
+            nv, own = self.model.nv, self.own
             state, deviation = (np.empty((len(qpos), 3 * nv)) for _ in range(2))
-            state[self.index[live]], deviation[self.index[live]] = (
-                found.state[live],
-                np.sqrt(found.variance[live]),
-            )
+            state[self.index[own]] = found.state[own]
+            deviation[self.index[own]] = np.sqrt(found.variance[own])
             qpos_sd = deviation[:, :nv]
             qpos = windowing.integrate(self.model, qpos, state[:, :nv])
             qvel, force = qvel + state[:, nv : 2 * nv], state[:, 2 * nv :]
@@ -188,7 +191,7 @@ class Smoother:
         transition[~self.last] = step[0][:, : 2 * nv]
         split = np.split(transition, [2 * nv], axis=2)
         args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
-        return Trajectory(*args)
+        return Trajectory(*args, Response(found.gains, self.index, self.own, nv))
 
     def _seen(self, off):
         """(qpos, qvel, and both as far as they were measured, NaN elsewhere) of the motion behind

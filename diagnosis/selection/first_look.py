@@ -25,7 +25,7 @@ def likely(missing, starts):
     motion mostly touches something. Kept are the effects of the setting as well.
     """
     chain, setting = missing.chain, missing.setting
-    touches = 2 * len(missing.free) < len(chain.begin)
+    touches = 2 * len(chain.used) < len(chain.begin)
     kept = [start for start in starts if start.candidate in setting]
     new = [start for start in starts if start.candidate not in setting]
     in_rows, in_windows, some = [], [], []

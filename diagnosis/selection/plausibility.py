@@ -42,7 +42,7 @@ TABLE = {
     "nonlinear_stiffness": [("per travel³", 0.5, -5.0, 5.0)],
     "spring_offset": [("force", 0.5, -2.0, 2.0)],
     "cogging": [
-        ("force", 0.2, -1.0, 1.0),
+        ("force", 0.7, -3.0, 3.0),
         ("plain", np.inf, 0.1, np.inf),
         ("plain", np.inf, -10, 10),
     ],

@@ -18,6 +18,7 @@ LADDER = 0.1, 0.4  # shares of a prior's scale
 BEGUN = 0.1  # share of an amplitude's scale, at which effects of several values are begun
 STATES = 300  # of the motion, at which forces are compared
 PROMISING = 3  # groups of starts that are simulated
+NEARER = 0.5, 0.25  # of the way to the next group, by which the best is moved
 STEP = 0.03  # share of a value's prior scale, or its way from nominal, that a step is at least
 
 
@@ -89,22 +90,27 @@ class Starts:
         return _full(candidate, np.zeros(len(values)), np.array([values]), prior)
 
     def _promising(self, candidate, whole):
-        """Of starts that come in groups, those of the groups whose force is most like the located
-        one."""
-        t = self.trajectory
+        """Of starts that come in evenly spaced groups, those of the groups whose force is most like
+        the located one, the best moved to where it is even more so."""
+        t, d, together = self.trajectory, self.usual.dof(candidate.place), candidate.effect.together
         rows = np.flatnonzero(~t.free)
         rows = rows[windowing.evenly(len(rows), STATES)]
         if not len(rows):
             return whole
-        zero = [0.0, *whole[0][1:]]
-        none, *forces = [self._applied(candidate, values, rows) for values in [zero, *whole]]
-        target, together, left = t.force[rows].ravel(), candidate.effect.together, []
-        for k in range(0, len(whole), together):
-            basis = np.stack([(f - none).ravel() for f in forces[k : k + together]], 1)
-            fit = np.linalg.lstsq(basis, target, rcond=None)[0]
-            left.append(np.sum((target - basis @ fit) ** 2))
-        best = sorted(np.argsort(left)[:PROMISING])
-        return [whole[k * together + i] for k in best for i in range(together)]
+        zero = self._applied(candidate, [0.0, *whole[0][1:]], rows)[:, d]
+
+        def left(group):
+            forces = [self._applied(candidate, tuple(values), rows)[:, d] for values in group]
+            basis = np.stack(forces, 1) - zero[:, None]
+            fit = np.linalg.lstsq(basis, t.force[rows, d], rcond=None)[0]
+            return np.sum((t.force[rows, d] - basis @ fit) ** 2)
+
+        groups = [np.array(whole[k : k + together]) for k in range(0, len(whole), together)]
+        order = sorted(groups, key=left)
+        best, step = order[0], groups[1] - groups[0]
+        for share in NEARER:
+            best = min((best, best - share * step, best + share * step), key=left)
+        return [tuple(values) for group in [best, *order[1:PROMISING]] for values in group]
 
     def _applied(self, candidate, values, rows):
         """Generalized forces (n, nv) of actuators and joints with a candidate, dry friction

@@ -60,6 +60,15 @@ def test_small_changes_are_those_of_the_simulator_where_it_keeps_to_the_motion()
         assert x @ y / np.sqrt((x @ x) * (y @ y)) > 0.999
 
 
+def test_what_a_heavier_joint_lacks_does_not_hang_by_what_else_is_missing(here):
+    """Effects superpose as forces: an accelerated armature needs its torque whatever brakes it."""
+    world, truth, chain = here
+    heavy = {world.candidate("armature", "pivot"): (0.03,)}
+    nominal, alone, beside, both = chain.residual([{}, heavy, truth, {**truth, **heavy}])
+    x, y = (nominal - alone).ravel(), (beside - both).ravel()
+    assert np.sqrt(np.mean((x - y) ** 2)) < 0.06 * np.sqrt(np.mean(x**2))  # but where it sticks
+
+
 def test_what_is_no_force_is_simulated(here):
     world, _, chain = here
     sensor = world.candidate("sensor_scale", "pivot")

@@ -9,8 +9,9 @@ import pytest
 from plants import DRIVEN_PENDULUM, recorded
 
 from diagnosis.estimation import windowing
-from diagnosis.estimation.smoother import LOUDER, Smoother
+from diagnosis.estimation.smoother import BLOCK, LOUDER, Smoother
 from diagnosis.recordings.recording import Recording
+from diagnosis.simulation.rows import RowMap
 from diagnosis.simulation.simulator import World
 
 ARM = """<mujoco><option timestep="0.005"/><default><geom contype="0" conaffinity="0"/></default>
@@ -228,3 +229,18 @@ def test_noise_is_between_what_differences_show_and_a_multiple_of_it():
         for _ in range(5):
             smoother._update(found, np.ones(len(smoother.qpos), bool))
         np.testing.assert_allclose(smoother.R[:1], times**2 * shown[:1])
+
+
+@pytest.mark.parametrize("name", ["drag at a joint", "both joints"])
+def test_blocks_that_are_smoothed_apart_join_without_a_jump(name):
+    """Where one ends and the next begins, the motion follows from the located force."""
+    xml, push = PUSHES[name]
+    runs = [moved(xml, seed, push, rows=3 * BLOCK)[0] for seed in (0, 1)]
+    world = World(mujoco.MjSpec.from_string(xml))
+    found, rows = Smoother(world, runs).locate({}), RowMap(world, runs, {})
+    begin = rows.begin
+    args = np.arange(len(begin)), found.qpos[begin], found.qvel[begin], found.force[begin]
+    jump = found.qvel[begin + 1] - rows.ahead(*args)[1]
+    edge = (begin + 1) % BLOCK == 0
+    usual = np.sqrt(np.mean(found.qvel_sd**2, 0))
+    assert edge.any() and (abs(jump[edge]) < 0.1 * usual).all()

@@ -133,3 +133,15 @@ def test_what_many_joints_lack_is_met_at_once_where_the_missing_force_shows_it(m
     motion, names = made(named, named["joint 0"] + 0.001 * residual, ahead)
     best = Beam(motion.columns, motion.evidence, force).nodes()[1][0]
     assert names(best) == {"joint 0"}
+
+
+def test_what_forces_speak_against_is_not_met_however_well_it_predicts():
+    rng, ahead = np.random.default_rng(5), scene()
+    whole, rest, other = (clustered(rng, ahead, share=0.0) for _ in range(3))
+    columns = {"right": whole + 0.3 * rest, "mimic": whole + 0.1 * other}
+    motion, names = made(columns, whole, ahead)
+    assert "mimic" in names(motion.nodes()[1][0])
+    force, _ = made({"right": whole + 0.1 * rest, "mimic": -0.5 * whole}, whole, ahead)
+    located = SimpleNamespace(rows=[0], evidence=lambda options: force.evidence)
+    met = Beam(motion.columns, motion.evidence, located).nodes()[1]
+    assert names(met[0]) == {"right"} and not any("mimic" in names(node) for node in met)

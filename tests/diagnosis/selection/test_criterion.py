@@ -273,7 +273,9 @@ def test_what_is_farther_from_the_first_things_to_think_of_and_freer_is_more_com
     assert of("coulomb_friction", "viscous_damping") == 2
     assert of("gain") < of("armature") < of("dead_zone") < of("stribeck_friction")
     assert of("stribeck_friction") < complexity([curve])
-    assert complexity([curve]) == 8
+    assert complexity([curve]) == 9
+    wave = world.curve("pivot", "position:pivot", (0.0, 0.1), None, True)
+    assert complexity([wave]) > of("cogging")  # which it would be, had it a name
     assert of("time_step") == 0  # no physics
 
 
