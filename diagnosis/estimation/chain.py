@@ -20,6 +20,15 @@ from diagnosis.simulation.rows import RowMap, coarse
 
 GROUPED = 19  # rows in each group, in which forces are compared
 OUTSIDE = 0.1  # share of a located force that may hang by rows outside of the windows
+INERTIAL = (  # fields of a model that its inertia hangs by
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_iquat",
+    "body_pos",
+    "dof_armature",
+    "tendon_armature",
+)
 ASTRAY = 1e3  # times its travel, to where a chain of transitions at stiff stops may run away
 
 
@@ -230,9 +239,6 @@ class Chain(Ahead):
             x = np.where(self.carried[:, t : t + 1], x, 0.0)
             out[:, t + 1] += np.where(self.known[:, t + 1], x[:, :nv], 0.0)
         return out
-
-
-INERTIAL = "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "dof_armature"
 
 
 def _as_heavy(model, other):

@@ -13,11 +13,12 @@ ROUNDING = 1e-12  # share added to variances: noise far smaller than these would
 
 @dataclass(frozen=True)
 class Gains:
-    """What a smoother does with errors: onward (T, blocks, n, n), those of predicted states from
-    row to row; precision (T, blocks, m, m) of measured less predicted, 0 for what is not measured;
-    variance (T, blocks, n, n) of predicted states."""
+    """What a smoother does with errors: transition (T, blocks, n, n), as given; keep (T, blocks, n,
+    n), what measuring leaves of an error; precision (T, blocks, m, m) of measured less predicted, 0
+    for what is not measured; variance (T, blocks, n, n) of predicted states."""
 
-    onward: np.ndarray
+    transition: np.ndarray
+    keep: np.ndarray
     precision: np.ndarray
     variance: np.ndarray
 
@@ -61,7 +62,7 @@ def smooth(A, c, Q, y, R, start, spread, counts=None):
     u = pushed - _times(np.swapaxes(K, -1, -2), behind)
     told = known if counts is None else known & counts[..., None]
     measurement = (u**2 * told).sum((0, 1)), (D * told).sum((0, 1))
-    gains = Gains(A @ keep, Finv, P)
+    gains = Gains(A, keep, Finv, P)
     return Smoothed(state, np.maximum(variance, 0.0), process, measurement, likelihood, gains)
 
 

@@ -18,8 +18,9 @@ class Response:
         """gains: a Smoother's last Gains; index (T, blocks): the rows of its blocks, own (T,
         blocks): which of them are taken from a block."""
         self.index, self.own, self.nv = index, own, nv
-        self.onward = np.float32(gains.onward)  # (T, blocks, n, n), of errors
-        self.precision = np.float32(gains.precision)  # (T, blocks, 2 nv, 2 nv), of errors
+        onward = gains.transition @ gains.keep  # (T, blocks, n, n), of errors
+        self.onward = np.float32(onward)
+        self.precision = np.float32(gains.precision)  # (T, blocks, 2 nv, 2 nv)
         self.variance = np.float32(gains.variance[..., 2 * nv :, :])  # (T, blocks, nv, n)
 
     def __call__(self, change):

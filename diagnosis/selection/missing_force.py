@@ -30,13 +30,9 @@ class MissingForce:
         setting has is taken over: a motion that is located anew hardly moves."""
         self.chain, self.setting = chain, setting
         self.rows = chain.telling()[: len(chain.telling()) // GROUPS * GROUPS]
-        self.seen, nv = np.isfinite(chain.noise), chain.model.nv
-        self.force, self.noise, self.weight = (
-            self._lacking([setting])[..., 0],
-            np.full(nv, np.inf),
-            1,
-        )
-        self.done, self.plain = {}, chain.plain(setting)
+        self.seen, self.plain = np.isfinite(chain.noise), chain.plain(setting)
+        self.force, self.noise = self._lacking([setting])[..., 0], np.full(chain.model.nv, np.inf)
+        self.done = {}
         if before and np.array_equal(before.rows, self.rows):
             known, inside = before.done.items(), {*setting, *before.setting}
             self.done = {key: done for key, done in known if key[0] not in inside}

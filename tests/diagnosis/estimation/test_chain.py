@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from plants import DRIVEN_PENDULUM, NOISE, recorded
+from plants import DRIVEN_PENDULUM, NOISE, SIZES, arm, record, recorded
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
-from diagnosis.estimation.chain import Chain
+from diagnosis.estimation.chain import Chain, _as_heavy
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.simulation import rows
 from diagnosis.simulation.simulator import World
@@ -185,3 +185,26 @@ def test_the_same_damping_in_a_drive_and_in_a_joint_does_the_same_in_a_row():
         start = np.zeros((1, 1)), np.ones((1, 1)), np.zeros((1, 1))
         ahead.append(row.ahead(np.zeros(1, int), *start)[1])
     assert abs(ahead[0] - ahead[1]).max() < 1e-9 < abs(1 - ahead[0]).max()
+
+
+def test_whether_a_models_inertia_is_another_one_is_told_of_every_effect():
+    """By the inertia matrices themselves, in any position."""
+    world, changed = arm("motors")[0], set()
+    qpos = np.random.default_rng(0).uniform(-1, 1, world.model.nq)
+
+    def inertia(model):
+        data, out = mujoco.MjData(model), np.eye(model.nv)
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(model, data)
+        for column in out:
+            mujoco.mj_mulM(model, data, column, column.copy())
+        return out
+
+    for candidate in world.candidates:
+        if candidate.place.kind != "sensor" and not world.adds_states(candidate):
+            setting = {candidate: SIZES[candidate.effect.name]}
+            model = rows.RowMap(world, [record(world)], setting).model
+            if not np.allclose(inertia(model), inertia(world.model), rtol=1e-9):
+                changed.add(candidate.effect.name)
+                assert not _as_heavy(model, world.model), candidate
+    assert changed >= {"mass", "center_of_mass", "armature", "coupled_inertia", "link_length"}
