@@ -61,6 +61,8 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no single effects beside the finalists": {"diagnosis.selection.identification:ALONE": 0},
     "what touches is told by positions as they are": {"diagnosis.estimation.smoother:REACH": 0.0},
     "three tones": {"diagnosis.effects.transmissions:TONES": (4.0, 8.0, 16.0)},
+    "blocks that do not overlap": {"diagnosis.estimation.smoother:LEAD": 0},
+    "waves at the numbers tried": {"diagnosis.selection.starts:NEARER": ()},
     "one horizon": {"diagnosis.estimation.ahead:HORIZONS": (1.0,)},
 }
 COLUMNS = (
