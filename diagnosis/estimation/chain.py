@@ -57,8 +57,8 @@ class Chain(Ahead):
             near = abs(self._carried_starts()) < ASTRAY * self.whole.travel[:, None]
         touched |= ~near.all((1, 2, 3))
         self.carried, self.touched = follows & ~touched[:, None], np.flatnonzero(touched)
-        told = ~trajectory.free & trajectory.driven.any((1, 2))
-        self.used = self.begin[told[self.begin]]
+        apart = ~trajectory.free & trajectory.driven.any((1, 2))  # from what touches
+        self.used = self.begin[apart[self.begin]]
         beside = windowing.difference(self.model, trajectory.qpos[self.rows], self.measured)
         self.beside = np.where(self.known, beside, 0.0)
         # columns are differences: what a coarse step does wrong it does with an effect and without
@@ -133,7 +133,7 @@ class Chain(Ahead):
         """Rows in which located forces are compared: from now on they are worked out along with
         every prediction."""
         if self.told is None:
-            self.told, self.inside = self._told(), self.missing(self.base, self.used)
+            self.told, self.lacks = self._told(), self.missing(self.base, self.used)
         return self.told
 
     def _told(self):
@@ -141,9 +141,8 @@ class Chain(Ahead):
         t = self.trajectory
         outside = ~t.free
         outside[self.begin] = False
-        beyond = np.where(outside[:, None, None], t.driven, 0.0)
-        near = abs(t.response(beyond)[self.used]).max((1, 2), initial=0.0) if outside.any() else 0.0
-        some = self.used[near < OUTSIDE]
+        beyond = t.response(t.driven * outside[:, None, None])
+        some = self.used[abs(beyond[self.used]).max((1, 2)) < OUTSIDE]
         return some[windowing.evenly(len(some), GROUPS * GROUPED)]
 
     def _along(self, settings, out):
@@ -162,7 +161,7 @@ class Chain(Ahead):
         if not every:
             return
         t = self.trajectory
-        less = np.stack([*every.values()], -1) - self.inside[..., None]
+        less = np.stack([*every.values()], -1) - self.lacks[..., None]
         change = np.zeros((len(t.qvel), *less.shape[1:]), np.float32)
         change[self.used] = np.where(np.isfinite(less), less, 0.0)
         force = t.force[self.told][..., None] + t.response(change)[self.told]

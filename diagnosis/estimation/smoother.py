@@ -113,9 +113,9 @@ class Smoother:
         blocks = []
         for a, b in zip(starts[:-1], starts[1:]):
             edges = np.linspace(a, b, max(1, round((b - a) / BLOCK)) + 1).astype(int)
-            ends = zip(np.maximum(edges[:-1] - LEAD, a), np.minimum(edges[1:] + LEAD, b))
-            blocks += [(*own, *whole) for own, whole in zip(zip(edges[:-1], edges[1:]), ends)]
-        first, end, begin, over = np.array(blocks).T
+            first, end = edges[:-1], edges[1:]
+            blocks.append([first, end, np.maximum(first - LEAD, a), np.minimum(end + LEAD, b)])
+        first, end, begin, over = np.concatenate(blocks, 1)
         rows = begin + np.arange((over - begin).max())[:, None]
         self.index, self.live = np.minimum(rows, over - 1), rows < over
         self.own = (rows >= first) & (rows < end)

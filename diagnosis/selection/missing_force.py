@@ -23,7 +23,8 @@ LEAST = 0.05  # of its RMS, that its usual size is taken to be
 
 class MissingForce:
     """In rows of a Chain where nothing touches, under a setting. force (n, nv), in units of what is
-    usual in each dof; noise (nv,): how well that is known; rows: all of a Chain that tell."""
+    usual in each dof; noise (nv,): how well that is known; rows (n,): those of the Chain in which
+    forces are compared, as many in each group."""
 
     def __init__(self, chain, setting, before=None):
         """before: a MissingForce in the same rows, from which what effects do there that neither

@@ -83,9 +83,8 @@ def test_what_no_row_tells_is_asked_in_windows(scene, monkeypatch):
     kept = kept_of(scene, each)
     assert rows < kept and kept - rows <= {"sensor_scale", "sensor_bias"}
     touching = Chain(world, chain.windows, chain.noise)
-    touching.start(chain.trajectory)
     free = np.ones(len(chain.trajectory.free), bool)
-    touching.trajectory = replace(chain.trajectory, free=free)
+    touching.start(replace(chain.trajectory, free=free))
     assert kept_of((world, touching, None), each) == {"coulomb_friction"}
 
 

@@ -62,14 +62,24 @@ def test_noisy_torques_speak_for_a_heavier_joint_in_the_simulator_and_not_along_
     right = {world.candidate("coulomb_friction", "pivot"): (FRICTION,)}
     for along, wrong in ((ahead, "better"), (chain, "worse")):
         nominal, *others = along.residual([{}, heavier, right])
-        none = np.zeros((*nominal.shape, 0))
-        reference = Evidence(along, nominal, none).reference
-        heavy, dry = (Evidence(along, x, none, reference).plain() for x in others)
-        start = Evidence(along, nominal, none, reference).plain()
+        empty = np.zeros((*nominal.shape, 0))
+        reference = Evidence(along, nominal, empty).reference
+        heavy, dry = (Evidence(along, x, empty, reference).plain() for x in others)
+        start = Evidence(along, nominal, empty, reference).plain()
         assert dry < start - 0.1
         assert heavy < start - 0.02 if wrong == "better" else heavy > start + 0.1
     none, worse, better = MissingForce(chain, {}).scores({}, heavier, right)
     assert worse.loss > none.loss + 0.05 > better.loss + 0.05
+
+
+def test_rows_tell_where_all_that_lies_outside_of_the_windows_touches():
+    """As the last rows of recordings that end with a robot on the ground."""
+    chain = located(0.0)[1]
+    free = ~np.isin(np.arange(len(chain.trajectory.free)), chain.begin)
+    assert free.any()
+    chain.start(replace(chain.trajectory, free=free))
+    rows = MissingForce(chain, {}).rows
+    assert rows.ndim == 1 and len(rows) and np.isin(rows, chain.begin).all()
 
 
 @pytest.mark.parametrize("touching", [True, False])
