@@ -39,7 +39,6 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no slow waves": {"diagnosis.selection.unmodelled_force:WAVES": (4.0, 30.0, 0.1)},
     "tiny steps": {"diagnosis.selection.starts:STEP": 0.0},
     "nine even knots at most": {"diagnosis.selection.unmodelled_force:FINE": 9},
-    "a curve is told beside names whatever its size": {"diagnosis.estimator:INSTEAD": 0.0},
     "no curves beside names": {"diagnosis.selection.unmodelled_force:LEAST": 2.0},
     "what is within the noise counts": {"diagnosis.selection.criterion:BEYOND": 0.0},
     "a member of a class is no worse, even by chance": {"diagnosis.selection.rivals:CHANCE": 1.0},

@@ -18,7 +18,7 @@ from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import rivals, transients, unmodelled_force
-from diagnosis.selection.adequacy import lacking
+from diagnosis.selection.adequacy import channel, lacking, share_left
 from diagnosis.selection.conditions import concentrated
 from diagnosis.selection.criterion import PRICE, complexity, paired
 from diagnosis.selection.event import Event
@@ -27,14 +27,12 @@ from diagnosis.selection.identification import (
     Found,
     Identification,
     physics,
+    said,
 )
 from diagnosis.selection.judge import Fitted, changing, without
 from diagnosis.selection.plausibility import plausible
-from diagnosis.unnamed import UNNAMED
+from diagnosis.unnamed import NEAREST, UNNAMED
 
-# of the force that the names of a joint explain, from which on a curve is told beside them: on a
-# real machine every curve is significant
-INSTEAD = 0.5
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
 
 
@@ -111,18 +109,34 @@ def _checked(search, found, fitted, others, log):
     for rest in unmodelled_force.each_joint(left)[:2]:
         finer = finer or search.finer(judge, fitted)
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
+        dof = world.model.joint(rest.joint).dofadr[0]
+        if mine and not share_left(fitted)[channel(fitted, dof)] > NEAREST:
+            continue
         # where no name is found, all that is told are a joint and a variable
         units = complexity([rest.candidate]) if mine else UNNAMED
-        beside = _beside(search, judge, finer, rest, PRICE * units)
+        tries = [_beside(search, judge, finer, rest, PRICE * units)]
+        tries += [_instead(search, found, finer, mine, rest.joint)] if mine else []
+        beside = min(filter(None, tries), key=lambda f: f.loss, default=None)
         if not beside:
             continue
-        log(f"  a curve beside: {rest.variables} {fitted.loss:.3f} -> {beside.loss:.3f}")
-        size = _force(found, trajectory, world, rest.joint)
-        if not mine or rest.size > INSTEAD * size:
-            fitted, finer = search.pruned(judge, beside, judge.fit({})) if mine else beside, None
-        if rest.candidate in fitted.setting:
-            break
+        log(f"  a curve at {rest.joint}: {beside.loss:.3f} {said(beside.setting)}")
+        fitted = search.pruned(judge, beside, judge.fit({})) if mine else beside
+        break
     return Outcome(found, fitted, trajectory, others, {}, {}, left, dependences)
+
+
+def _instead(search, found, fitted, names, joint):
+    """The Fitted set with the curve that the force at a joint follows best in the place of the
+    names there, or None where that is no better."""
+    rest = {c: v for c, v in fitted.setting.items() if c not in names}
+    trajectory = copy(found.smoother).locate(rest, found.trajectory, passes=1)
+    follows = unmodelled_force.dependences(search.world, trajectory, search.train, most=None)
+    curve = next((d for d in follows if d.joint == joint), None)
+    if not curve:
+        return None
+    alone = found.judge.fit({**rest, curve.candidate: curve.values}, steps=2)
+    better = alone.loss < fitted.loss and search.no_chance(paired(fitted.score, alone.score))
+    return alone if better else None
 
 
 def _sometimes(search, found, fitted, log):
@@ -214,12 +228,6 @@ def _at(world, candidate, joint):
     """Whether a finding acts at a joint."""
     joints = world.joints(candidate.place)
     return joints is not None and world.model.joint(joint).id in joints
-
-
-def _force(found, trajectory, world, joint):
-    """RMS of the force that the names explain at a joint."""
-    d = world.model.joint(joint).dofadr[0]
-    return float(np.sqrt(np.mean((found.first.force[:, d] - trajectory.force[:, d]) ** 2)))
 
 
 def _strain(candidate, values, prior):

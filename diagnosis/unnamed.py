@@ -3,9 +3,8 @@ depends on.
 
 findings = led(world, outcome, findings, something)
 
-A name stands first only where the error of its joint goes with it, or what is left there follows
-nothing: every machine has disturbances. Where much is left, `unknown` leads, and the name is one of
-those that it may be.
+A name stands first only where the error of its joint goes with it, as far as a perfect simulator's
+would. Where much is left, `unknown` leads, and the name is one of those that it may be.
 """
 
 import numpy as np
@@ -13,36 +12,16 @@ import numpy as np
 from diagnosis.effects.base import HINGE, JOINT_TRANSMISSIONS, SLIDE, is_numerical
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation import windowing
-from diagnosis.selection.criterion import BEYOND, PRICE
+from diagnosis.selection.adequacy import channel, share_left
+from diagnosis.selection.criterion import PRICE
 from diagnosis.selection.identification import LEVEL
 from diagnosis.selection.plausibility import at_limit, plausible
 from diagnosis.selection.unmodelled_force import ABOVE
 
-# of a joint's error, and of its force that follows anything, that names leave: they are the nearest
+# of a joint's error that names leave beyond a perfect simulator's, from which they are the nearest
 NEAREST = 0.25
 UNNAMED = 2  # units of complexity of a force where nothing has a name
 MOST = 3  # names that an unknown force may have, and variables that it depends on
-
-
-def left(fitted):
-    """Share (n,) of the error beyond the noise that a Fitted set leaves in each channel, start
-    states free; NaN where the nominal model errs by no more than the noise."""
-    evidence = fitted.evidence
-    noise = np.where(evidence.count > 0, evidence.noise**2, np.inf)
-    excess = []
-    for square in (evidence.reference, evidence.squares((), np.zeros(0))):
-        beyond = np.maximum(square - noise, 0.0).reshape(len(square), evidence.channels, -1)
-        excess.append(beyond.sum((0, 2)))
-    told = (evidence.reference > BEYOND**2 * noise).reshape(len(noise), evidence.channels, -1)
-    return np.sqrt(excess[1] / np.where(told.any((0, 2)), excess[0], np.nan))
-
-
-def follows(outcome, joint):
-    """Share of the force that followed anything at a joint which still does so beside the names, by
-    more than it scatters; infinite where nothing did before."""
-    size = lambda found: next((d.size for d in found if d.joint == joint), 0.0)
-    before = size(outcome.dependences)
-    return size([d for d in outcome.left if d.above > ABOVE]) / before if before else np.inf
 
 
 def _standing_out(world, outcome, joints):
@@ -58,17 +37,12 @@ def _standing_out(world, outcome, joints):
 
 def main_joint(world, outcome, candidate, shares):
     """(joint, share of its error that is left) of the joint in which a finding acts and most force
-    is missing; (None, NaN) where it has no such place. shares: of the channels, see left()."""
+    is missing; (None, NaN) where it has no such place. shares: of the channels (share_left())."""
     joint = _standing_out(world, outcome, sorted(world.joints(candidate.place) or ()))
     if joint is None:
         return None, np.nan
-    return joint, float(shares[_channel(outcome, world.model, world.model.joint(joint).id)])
-
-
-def _channel(outcome, model, joint):
-    """Index of the channel that a joint's first degree of freedom belongs to."""
-    channels = outcome.fitted.columns.ahead.channels
-    return [model.jnt_dofadr[joint] in dofs for dofs in channels].index(True)
+    dof = world.model.joint(joint).dofadr[0]
+    return joint, float(shares[channel(outcome.fitted, dof)])
 
 
 def missing_most(world, outcome, something):
@@ -80,7 +54,8 @@ def missing_most(world, outcome, something):
     loud = {d.joint for d in outcome.left if d.above > ABOVE}
     gains = {}
     for j in np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))):
-        name, lack = model.joint(j).name, outcome.lacks[_channel(outcome, model, j)]
+        name, d = model.joint(j).name, model.jnt_dofadr[j]
+        lack = outcome.lacks[channel(outcome.fitted, d)]
         worth = lack.gain > PRICE * UNNAMED and lack.p_value < level
         if worth and (something or name in loud):
             gains[name] = lack.gain
@@ -173,7 +148,7 @@ def led(world, outcome, findings, something):
     """
     # of two at a joint the more important one: what acts at times may stand beside a curve
     leads = {f["place"]["name"]: f for _, f in reversed(findings) if f["effect"] == "unknown"}
-    order, shares = [], left(outcome.fitted)  # findings, and the joints of unknown forces
+    order, shares = [], share_left(outcome.fitted)  # findings, and the joints of unknown forces
     names = {}  # that these may have
     for candidate, finding in findings:
         joint = finding["place"]["name"] if finding["effect"] == "unknown" else None
@@ -182,7 +157,7 @@ def led(world, outcome, findings, something):
             told = share if np.isfinite(share) else None
             finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
             edge = _at_edge(outcome, candidate)
-            if at and (edge or share > NEAREST and follows(outcome, at) > NEAREST):
+            if at and (edge or share > NEAREST):
                 joint = at
                 names.setdefault(joint, []).append(finding)
             elif edge:

@@ -22,12 +22,14 @@ def likely(missing, starts):
 
     What acts within a row is asked a row ahead. Effects with states of their own or of the sensors
     are asked in short windows, as is what changes nothing in the rows, and everything where the
-    motion mostly touches something. Kept are the effects of the setting as well.
+    motion mostly touches something. Kept are the effects of the setting as well, and waves, which
+    are those most like the located force already.
     """
     chain, setting = missing.chain, missing.setting
     touches = 2 * len(chain.used) < len(chain.begin)
-    kept = [start for start in starts if start.candidate in setting]
-    new = [start for start in starts if start.candidate not in setting]
+    chosen = [start.candidate in setting or start.merges for start in starts]
+    kept = [start for start, known in zip(starts, chosen) if known]
+    new = [start for start, known in zip(starts, chosen) if not known]
     in_rows, in_windows, some = [], [], []
     rounds = len(chain.channels) + MORE
     for start in new:

@@ -17,8 +17,7 @@ PROBES = 12  # starts of one candidate that are looked at, but for those that co
 LADDER = 0.1, 0.4  # shares of a prior's scale
 BEGUN = 0.1  # share of an amplitude's scale, at which effects of several values are begun
 STATES = 300  # of the motion, at which forces are compared
-PROMISING = 3  # groups of starts that are simulated
-NEARER = 0.5, 0.25  # of the way to the next group, by which the best is moved
+NEARER = 0.5, 0.25  # of the way to the next group of starts, by which the best is moved
 STEP = 0.03  # share of a value's prior scale, or its way from nominal, that a step is at least
 
 
@@ -90,8 +89,8 @@ class Starts:
         return _full(candidate, np.zeros(len(values)), np.array([values]), prior)
 
     def _promising(self, candidate, whole):
-        """Of starts that come in evenly spaced groups, those of the groups whose force is most like
-        the located one, the best moved to where it is even more so."""
+        """Of starts that come in evenly spaced groups, those of the group whose force is most like
+        the located one, moved to where it is even more so."""
         t, d, together = self.trajectory, self.usual.dof(candidate.place), candidate.effect.together
         rows = np.flatnonzero(~t.free)
         rows = rows[windowing.evenly(len(rows), STATES)]
@@ -106,11 +105,10 @@ class Starts:
             return np.sum((t.force[rows, d] - basis @ fit) ** 2)
 
         groups = [np.array(whole[k : k + together]) for k in range(0, len(whole), together)]
-        order = sorted(groups, key=left)
-        best, step = order[0], groups[1] - groups[0]
+        best, step = min(groups, key=left), groups[1] - groups[0]
         for share in NEARER:
             best = min((best, best - share * step, best + share * step), key=left)
-        return [tuple(values) for group in [best, *order[1:PROMISING]] for values in group]
+        return [*map(tuple, best)]
 
     def _applied(self, candidate, values, rows):
         """Generalized forces (n, nv) of actuators and joints with a candidate, dry friction

@@ -112,12 +112,13 @@ def _factors(model, trajectory, ctrl, j, variable):
     and of time, the sign of its velocity, as friction has, its speed, as what has to be moved has,
     and what its drives are asked for."""
     name, out = windowing.joint_name(model, j), {None: np.ones(len(ctrl))}
-    d = model.jnt_dofadr[j]
-    if variable in ("time", f"position:{name}"):
+    d, drives = model.jnt_dofadr[j], drives_of(model, j)
+    asked_for = [f"control:{model.actuator(a).name}" for a in drives]
+    if variable in ("time", f"position:{name}", *asked_for):
         out[f"velocity:{name}"] = trajectory.direction()[:, d]
         out[f"speed:{name}"] = abs(trajectory.qvel[:, d])
     if variable in ("time", f"position:{name}", f"velocity:{name}"):
-        for a in drives_of(model, j):
+        for a in drives:
             times = asked(model, a, trajectory.qpos, trajectory.qvel, ctrl)
             out[f"control:{model.actuator(a).name}"] = times
     return out

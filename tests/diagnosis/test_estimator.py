@@ -93,6 +93,16 @@ def test_what_no_catalogue_knows_is_called_unknown():
     assert diagnosis.summary["verdict"] == "unresolved"
 
 
+def test_a_damping_in_one_direction_is_no_viscous_damping():
+    """The nearest name removes half of the error: a curve takes its place, and predicts."""
+    summary = diagnosed(push=lambda time, q, v: -0.3 * max(v, 0.0)).summary
+    [finding] = summary["findings"]
+    assert (finding["effect"], finding["place"]["name"]) == ("unknown", "pivot")
+    assert finding["depends_on"] == ["velocity:pivot"]
+    figures = summary["fit"]["held_out"]
+    assert figures["after"] < 0.2 * figures["before"]
+
+
 def test_a_push_for_a_while_is_placed_in_time():
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     runs = [

@@ -34,30 +34,27 @@ def smoothed(elbow, shoulder=0.0, scatter=0.1):
     return Trajectory(none, none, force, none, none, sd, {}, free, none)
 
 
-def outcome(trajectory, errors=(1.0, 1.0), depends=(), friction=0.1, gains=(1, 1), gone=()):
-    """errors: of the elbow, before and after, in ten noises; the shoulder errs by none. gains:
-    nats that a perfect simulator would remove in the shoulder and in the elbow. gone: what was not
-    handed over."""
+@pytest.fixture(autouse=True)
+def shares(monkeypatch):
+    monkeypatch.setattr(unnamed, "share_left", lambda fitted: fitted.shares)
+
+
+def outcome(trajectory, share=1.0, depends=(), friction=0.1, gains=(1, 1), gone=()):
+    """share: of the error of the elbow that is left; the shoulder erred by none. gains: nats that a
+    perfect simulator would remove in the shoulder and in the elbow. gone: what was not handed
+    over."""
     dependences = [SimpleNamespace(joint=j, variables=v, size=1.0, above=2.0) for j, v in depends]
-    before, after = (np.array([[1.0, 1.0, 100 * e**2, 100 * e**2]]) for e in errors)
-    evidence = SimpleNamespace(
-        count=np.ones((1, 4)),
-        noise=np.ones(4),
-        channels=2,
-        reference=before,
-        squares=lambda columns, amounts: after,
-    )
     ahead = SimpleNamespace(channels=[np.array([0]), np.array([1])])
     setting = {FRICTION: (friction,), STIFFNESS: (0.1,), MASS: (0.3,)}
     columns = SimpleNamespace(ahead=ahead)
-    fitted = SimpleNamespace(evidence=evidence, columns=columns, setting=setting)
+    left = np.array([np.nan, share])
+    fitted = SimpleNamespace(shares=left, columns=columns, setting=setting)
     found = SimpleNamespace(first=trajectory, usual=USUAL, fitted=fitted)
     handed = SimpleNamespace(gone=list(gone))
     return SimpleNamespace(
         found=found,
         fitted=fitted,
         left=dependences,
-        dependences=[],
         handed=handed,
         lacks=[Comparison(gain, 1e-9) for gain in gains],
     )
@@ -89,7 +86,7 @@ DEPENDS = [("elbow", ("position:elbow", "velocity:elbow")), ("shoulder", ("time"
     ],
 )
 def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequate):
-    given = outcome(smoothed(1.0), (1.0, after), DEPENDS)
+    given = outcome(smoothed(1.0), after, DEPENDS)
     told = unnamed.led(WORLD, given, [finding(FRICTION)], True)
     [only] = told
     assert (only["effect"], only["adequate"]) == (effect, adequate)
@@ -100,31 +97,16 @@ def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequat
         assert only["evidence"]["held_out_error_removed"] == 0.4
 
 
-@pytest.mark.parametrize(
-    "size, above, effect",
-    [(3.0, 2.0, "coulomb_friction"), (5.0, 2.0, "unknown"), (5.0, 0.9, "coulomb_friction")],
-)
-def test_a_name_stands_where_what_it_leaves_follows_little(size, above, effect):
-    """Of a force of 16 that followed something, curves predict 3 or 5 beside the name, by so much
-    of how far it scatters."""
-    given = outcome(smoothed(1.0), (1.0, 0.7), DEPENDS)
-    elsewhere, there = (SimpleNamespace(joint=j, size=16.0) for j in ("shoulder", "elbow"))
-    given.dependences, given.left[0].size = [elsewhere, there], size
-    given.left[0].above = above
-    [only] = unnamed.led(WORLD, given, [finding(FRICTION)], True)
-    assert only["effect"] == effect
-
-
 def test_an_unknown_force_varies_with_what_its_nearest_name_does():
     nearest = finding(FRICTION)
     nearest[1]["depends_on"] = ["velocity:elbow"]
-    told = unnamed.led(WORLD, outcome(smoothed(1.0), (1.0, 0.7), DEPENDS), [nearest], True)
+    told = unnamed.led(WORLD, outcome(smoothed(1.0), 0.7, DEPENDS), [nearest], True)
     assert told[0]["depends_on"] == ["velocity:elbow", "position:elbow"]
 
 
 def test_names_that_share_a_joint_are_one_unknown_force():
     given = [finding(FRICTION), finding(STIFFNESS, removed=0.1, p=1e-9)]
-    told = unnamed.led(WORLD, outcome(smoothed(1.0), (1.0, 0.9), DEPENDS), given, True)
+    told = unnamed.led(WORLD, outcome(smoothed(1.0), 0.9, DEPENDS), given, True)
     [only] = told
     names = [o["effect"] for o in only["also_possible"]]
     assert names == ["coulomb_friction", "stiffness"]
@@ -135,7 +117,7 @@ def test_names_that_share_a_joint_are_one_unknown_force():
 def test_members_of_a_names_class_follow_all_names():
     friction, stiffness = finding(FRICTION), finding(STIFFNESS)
     friction[1]["also_possible"] = [{"effect": "dead_zone"}, {"effect": "gain"}]
-    given = outcome(smoothed(1.0), (1.0, 0.9), DEPENDS)
+    given = outcome(smoothed(1.0), 0.9, DEPENDS)
     [only] = unnamed.led(WORLD, given, [friction, stiffness], True)
     names = [o["effect"] for o in only["also_possible"]]
     assert names == ["coulomb_friction", "stiffness", "dead_zone"]
@@ -148,7 +130,7 @@ def test_a_curve_that_was_found_leads_the_names_at_its_joint():
     friction = finding(FRICTION)
     friction[1]["depends_on"] = ["velocity:elbow"]
     given = [friction, known]
-    told = unnamed.led(WORLD, outcome(smoothed(1.0), (1.0, 0.9), DEPENDS), given, True)
+    told = unnamed.led(WORLD, outcome(smoothed(1.0), 0.9, DEPENDS), given, True)
     [only] = told
     assert only["depends_on"] == ["position:elbow", "velocity:elbow"]
     assert only["written_as"] == "python"
@@ -216,21 +198,21 @@ def test_what_kept_back_recordings_spoke_against_is_an_unknown_force_at_its_join
     assert only["depends_on"] == ["velocity:elbow"] and not only["adequate"]
     [only] = unnamed.led(WORLD, outcome(loud, depends=DEPENDS, gone=[FRICTION]), [], False)
     assert only["depends_on"] == ["velocity:elbow", "position:elbow"]  # what it leaves as well
-    kept = unnamed.led(WORLD, outcome(loud, (1.0, 0.1), gone=[FRICTION]), [finding(MASS)], False)
+    kept = unnamed.led(WORLD, outcome(loud, 0.1, gone=[FRICTION]), [finding(MASS)], False)
     assert [f["effect"] for f in kept] == ["mass"]
     curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))  # tried, and never earned
     assert unnamed.led(WORLD, outcome(loud, gone=[curve]), [], False) == []
 
 
 def test_what_lies_within_the_noise_says_nothing_against_a_name():
-    [only] = unnamed.led(WORLD, outcome(smoothed(0.1), (0.1, 0.1)), [finding(MASS)], True)
+    [only] = unnamed.led(WORLD, outcome(smoothed(0.1), np.nan), [finding(MASS)], True)
     assert only["effect"] == "mass" and only["adequate"]
     assert only["evidence"]["error_left"] is None
 
 
 def test_a_value_at_the_edge_of_what_was_tried_is_no_name():
     edge = plausible(FRICTION, USUAL).high[0]
-    given = outcome(smoothed(1.0), (1.0, 0.1), DEPENDS, friction=edge)
+    given = outcome(smoothed(1.0), 0.1, DEPENDS, friction=edge)
     [only] = unnamed.led(WORLD, given, [finding(FRICTION)], True)
     assert only["effect"] == "unknown"
     assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]

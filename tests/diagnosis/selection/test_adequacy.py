@@ -7,20 +7,24 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.smoother import Smoother
-from diagnosis.selection.adequacy import lacking
+from diagnosis.selection.adequacy import lacking, share_left
 from diagnosis.selection.judge import Judge
 from diagnosis.selection.plausibility import Usual
 from diagnosis.simulation.simulator import World
 
 
-def judged(seed, **hidden):
-    """The nominal pendulum, Fitted on two runs that hide something."""
+def judged(seed, told=None, **hidden):
+    """The nominal pendulum, or one with what is told {(effect, place): values}, Fitted on two runs
+    that hide something."""
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     runs = [recorded(f"run{i}.csv", 2 * seed + i, **hidden) for i in range(2)]
     smoother = Smoother(world, runs)
     ahead = Ahead(world, cut_ahead(runs), smoother.position_noise)
     ahead.start(smoother.locate({}))
-    return Judge(ahead, Usual(world, runs, smoother.scale)).fit({})
+    judge = Judge(ahead, Usual(world, runs, smoother.scale))
+    nothing = judge.fit({})
+    setting = {world.candidate(*key): values for key, values in (told or {}).items()}
+    return judge.fit(setting, steps=0) if told else nothing
 
 
 def test_a_true_model_lacks_nothing():
@@ -32,6 +36,22 @@ def test_a_true_model_lacks_nothing():
 def test_a_missing_force_is_lacking():
     [lack] = lacking(judged(0, damping=0.1))
     assert lack.gain > 0.2 and lack.p_value < 1e-3
+
+
+def test_a_name_leaves_what_it_does_not_explain():
+    """The error of a damping that is twice its model's, as a name for it explains all, half, or
+    next to none."""
+    damping, length = ("viscous_damping", "pivot"), ("stiffness", "pivot")
+    shares = [
+        float(share_left(judged(0, told, damping=0.1))[0])
+        for told in (None, {length: (1e-4,)}, {damping: (0.075,)}, {damping: (0.1,)})
+    ]
+    assert shares[0] == 1.0 and shares[1] == pytest.approx(1.0, abs=0.05)
+    assert shares[2] == pytest.approx(0.5, abs=0.1) and shares[3] < 0.1
+
+
+def test_what_is_within_the_noise_leaves_no_share():
+    assert np.isnan(share_left(judged(0))).all()
 
 
 def test_drawn_residuals_are_noise_and_what_start_states_bring():

@@ -66,6 +66,16 @@ def test_what_is_missing_is_kept_first(scene, monkeypatch):
     assert len(kept_of(scene, some, friction)) == 2
 
 
+def test_waves_that_the_located_force_chose_are_kept(scene, monkeypatch):
+    """Row by row a fast ripple explains next to nothing of a noisy motion."""
+    monkeypatch.setattr(first_look, "EACH", 1)
+    monkeypatch.setattr(first_look, "MORE", 0)
+    ripple, friction = starts(scene, "cogging")[:1], starts(scene, "coulomb_friction")
+    waves = [replace(start, merges=True) for start in ripple]
+    assert kept_of(scene, [*ripple, *friction]) == {"coulomb_friction"}
+    assert kept_of(scene, [*waves, *friction]) == {"coulomb_friction", "cogging"}
+
+
 def test_what_shows_only_beside_the_best_is_kept(monkeypatch):
     other = located(damping=0.09, kept=0.0)  # as a fit without dry friction has it
     monkeypatch.setattr(first_look, "EACH", 1)

@@ -73,6 +73,13 @@ def test_a_friction_over_the_travel_depends_on_position_and_on_the_sign_of_veloc
     assert found.variables == ("position:j", "velocity:j") and found.share > 0.8
 
 
+def test_a_friction_that_its_drive_lessens_depends_on_control_and_on_the_sign_of_velocity():
+    law = lambda q, v, u, t: at(0, -0.2 * np.exp(-abs(u[:, 0])) * np.sign(v[:, 0]))
+    found = dependences(*made_up(law))[0]
+    assert found.variables == ("control:m", "velocity:j") and found.share > 0.8
+    assert found.candidate.effect.factor == "velocity:j"
+
+
 def test_a_ripple_that_grows_with_speed_depends_on_position_and_velocity():
     law = lambda q, v, u, t: at(0, 0.1 * v[:, 0] ** 2 * np.sin(9 * q[:, 0]))
     found = dependences(*made_up(law))[0]
