@@ -256,7 +256,12 @@ def _hand_over(search, held, kept_back, outcome, log):
     def refit(some, out):  # what made up for a finding that goes may be another then
         pool[:] = [c for c in pool if c is not out]
         near = [c for c in some if rivals.meet(world, c, out)]
-        fitted, told = _classes(search, found, judge.fit(some, steps=3), log, pool, near)
+        plain = judge.fit(some, steps=3)
+        fitted, told = _classes(search, found, plain, log, pool, near)
+        swapped = fitted.setting.keys() != plain.setting.keys()
+        # what takes another's place may only make up for what is gone
+        if swapped and decides.worse(fitted.setting, plain.setting) > decides.scattered():
+            fitted, told = plain, {}
         told, still = {**outcome.others, **told}, set(pool) - set(fitted.setting)
         outcome.others = {c: [o for o in told[c] if o[0] in still] for c in told}
         nothing = judge.fit({})

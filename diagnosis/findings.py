@@ -57,7 +57,8 @@ def assemble(world, train, held_out, outcome):
     left = unexplained(figure["before"], figure["after"], figure["floor"], check.scatter)
     if not outcome.earned and figure["after"] < COLOURED * figure["floor"]:
         left = 0.0  # noise that is not white does as much
-    findings = led(world, outcome, _findings(world, outcome, bounds, figure), left > 0)
+    findings = _findings(world, outcome, bounds, figure)
+    findings = led(world, outcome, findings, left > 0, figure["channels"])
     hint = outcome.left[0] if outcome.left and left > 0 else None
     summary = {
         "format": 2,

@@ -113,6 +113,11 @@ class Check:
         as recorded, and as they are smoothed under it; infinite where they do not run."""
         return np.array([self._parts(files, w) for w in (self.windows, self.smoothed(setting))])
 
+    def worse(self, setting, other):
+        """By how much a setting's files predict worse than another one's, at least."""
+        mine, others = (self.squares(Files.of(self.world, s), s) for s in (setting, other))
+        return _worse(mine, others)
+
     def _parts(self, files, windows):
         """Parts of the squared error (W,) of windows begun otherwise."""
         model = self.world.model

@@ -1,7 +1,7 @@
 """What no name earns: a force that is missing, told as `unknown`, at its joint and with what it
 depends on.
 
-findings = led(world, outcome, findings, something)
+findings = led(world, outcome, findings, something, channels)
 
 A name stands first only where the error of its joint goes with it, as far as a perfect simulator's
 would. Where much is left, `unknown` leads, and the name is one of those that it may be.
@@ -43,6 +43,15 @@ def main_joint(world, outcome, candidate, shares):
         return None, np.nan
     dof = world.model.joint(joint).dofadr[0]
     return joint, float(shares[channel(outcome.fitted, dof)])
+
+
+def held_out_share(errors):
+    """Share of the nominal model's held-out error of a channel that is left, both beyond a perfect
+    simulator's; infinite where it shows nothing. errors: {"before", "after", "floor"}."""
+    before, after, floor = (errors[key] for key in ("before", "after", "floor"))
+    if not np.isfinite([before, after]).all() or before <= floor:
+        return np.inf
+    return np.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
 
 
 def missing_most(world, outcome, something):
@@ -139,12 +148,13 @@ def _unearned(world, outcome, shares, something):
     return missing_most(world, outcome, something), ()
 
 
-def led(world, outcome, findings, something):
+def led(world, outcome, findings, something, channels):
     """Findings with `unknown` in the place of names that leave much of the error of their joint or
     have a value at the edge of what was tried, or where something is missing and nothing has a
     name: a finer time step is none.
 
-    findings: [(candidate or None, finding)], the most important first.
+    findings: [(candidate or None, finding)], the most important first; channels {channel: errors}:
+    of held-out recordings. What these show to be explained is, whatever the others leave.
     """
     # of two at a joint the more important one: what acts at times may stand beside a curve
     leads = {f["place"]["name"]: f for _, f in reversed(findings) if f["effect"] == "unknown"}
@@ -154,6 +164,8 @@ def led(world, outcome, findings, something):
         joint = finding["place"]["name"] if finding["effect"] == "unknown" else None
         if candidate and joint is None:
             at, share = main_joint(world, outcome, candidate, shares)
+            if f"qpos:{at}" in channels:
+                share = min(share, held_out_share(channels[f"qpos:{at}"]))
             told = share if np.isfinite(share) else None
             finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
             edge = _at_edge(outcome, candidate)

@@ -34,6 +34,15 @@ def test_a_finding_that_predicts_worse_is_not_handed_over(kept_back):
     assert check.error(handed.files) < handed.without[damping]
 
 
+def test_by_how_much_one_set_predicts_worse_than_another(kept_back):
+    world, check = kept_back
+    damping = world.candidate("viscous_damping", "pivot")
+    near, far = {damping: (0.1,)}, {damping: (0.2,)}
+    more = check.error(Files.of(world, far)) ** 2 - check.error(Files.of(world, near)) ** 2
+    assert check.worse(far, near) == pytest.approx(more, rel=0.5)
+    assert check.worse(far, near) > check.scattered() > 0 > check.worse(near, far)
+
+
 def test_findings_that_do_harm_together_all_go(kept_back):
     world, check = kept_back
     wrong = {world.candidate("bias", "drive"): (0.3,), world.candidate("gain", "drive"): (1.5,)}

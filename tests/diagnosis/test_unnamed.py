@@ -60,6 +60,10 @@ def outcome(trajectory, share=1.0, depends=(), friction=0.1, gains=(1, 1), gone=
     )
 
 
+def led(world, given, findings, something, channels={}):
+    return unnamed.led(world, given, findings, something, channels)
+
+
 def finding(candidate, removed=0.4, p=1e-5, written="mjcf"):
     return candidate, {
         "effect": candidate.effect.name,
@@ -87,7 +91,7 @@ DEPENDS = [("elbow", ("position:elbow", "velocity:elbow")), ("shoulder", ("time"
 )
 def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequate):
     given = outcome(smoothed(1.0), after, DEPENDS)
-    told = unnamed.led(WORLD, given, [finding(FRICTION)], True)
+    told = led(WORLD, given, [finding(FRICTION)], True)
     [only] = told
     assert (only["effect"], only["adequate"]) == (effect, adequate)
     if effect == "unknown":
@@ -97,16 +101,32 @@ def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequat
         assert only["evidence"]["held_out_error_removed"] == 0.4
 
 
+@pytest.mark.parametrize(
+    "before, after, floor, effect, share",
+    [
+        (10.0, 2.0, 3.0, "coulomb_friction", 0.0),  # all is explained
+        (10.0, 6.0, 3.0, "unknown", None),
+        (3.0, 2.9, 3.1, "unknown", None),  # they show nothing
+        (10.0, np.inf, 3.0, "unknown", None),
+    ],
+)
+def test_held_out_recordings_may_show_that_a_name_is_enough(before, after, floor, effect, share):
+    errors = {"qpos:elbow": {"before": before, "after": after, "floor": floor}}
+    given = outcome(smoothed(1.0), 0.7, DEPENDS)
+    [only] = led(WORLD, given, [finding(FRICTION)], True, errors)
+    assert only["effect"] == effect and only["evidence"].get("error_left") == share
+
+
 def test_an_unknown_force_varies_with_what_its_nearest_name_does():
     nearest = finding(FRICTION)
     nearest[1]["depends_on"] = ["velocity:elbow"]
-    told = unnamed.led(WORLD, outcome(smoothed(1.0), 0.7, DEPENDS), [nearest], True)
+    told = led(WORLD, outcome(smoothed(1.0), 0.7, DEPENDS), [nearest], True)
     assert told[0]["depends_on"] == ["velocity:elbow", "position:elbow"]
 
 
 def test_names_that_share_a_joint_are_one_unknown_force():
     given = [finding(FRICTION), finding(STIFFNESS, removed=0.1, p=1e-9)]
-    told = unnamed.led(WORLD, outcome(smoothed(1.0), 0.9, DEPENDS), given, True)
+    told = led(WORLD, outcome(smoothed(1.0), 0.9, DEPENDS), given, True)
     [only] = told
     names = [o["effect"] for o in only["also_possible"]]
     assert names == ["coulomb_friction", "stiffness"]
@@ -118,7 +138,7 @@ def test_members_of_a_names_class_follow_all_names():
     friction, stiffness = finding(FRICTION), finding(STIFFNESS)
     friction[1]["also_possible"] = [{"effect": "dead_zone"}, {"effect": "gain"}]
     given = outcome(smoothed(1.0), 0.9, DEPENDS)
-    [only] = unnamed.led(WORLD, given, [friction, stiffness], True)
+    [only] = led(WORLD, given, [friction, stiffness], True)
     names = [o["effect"] for o in only["also_possible"]]
     assert names == ["coulomb_friction", "stiffness", "dead_zone"]
 
@@ -130,7 +150,7 @@ def test_a_curve_that_was_found_leads_the_names_at_its_joint():
     friction = finding(FRICTION)
     friction[1]["depends_on"] = ["velocity:elbow"]
     given = [friction, known]
-    told = unnamed.led(WORLD, outcome(smoothed(1.0), 0.9, DEPENDS), given, True)
+    told = led(WORLD, outcome(smoothed(1.0), 0.9, DEPENDS), given, True)
     [only] = told
     assert only["depends_on"] == ["position:elbow", "velocity:elbow"]
     assert only["written_as"] == "python"
@@ -140,13 +160,13 @@ def test_a_curve_that_was_found_leads_the_names_at_its_joint():
 def test_of_two_unknown_forces_at_a_joint_the_more_important_one_is_told():
     curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))
     first, second = (finding(curve, removed)[1] for removed in (0.4, 0.0))
-    [only] = unnamed.led(WORLD, outcome(smoothed(0.1)), [(None, first), (None, second)], True)
+    [only] = led(WORLD, outcome(smoothed(0.1)), [(None, first), (None, second)], True)
     assert only["evidence"]["held_out_error_removed"] == 0.4
 
 
 def test_where_nothing_has_a_name_the_joint_that_lacks_most_is_told():
     both = outcome(smoothed(0.3), depends=DEPENDS, gains=(1.0, 0.9))
-    [only] = unnamed.led(WORLD, both, [], True)
+    [only] = led(WORLD, both, [], True)
     assert (only["effect"], only["place"]["name"]) == ("unknown", "shoulder")
     assert only["depends_on"] == ["time"] and only["written_as"] == "none"
 
@@ -154,13 +174,13 @@ def test_where_nothing_has_a_name_the_joint_that_lacks_most_is_told():
 def test_a_finer_time_step_is_no_name():
     finer = {"effect": "time_step", "place": {"kind": "world", "name": "world"}}
     loud = outcome(smoothed(0.3), gains=(1.0, 0.9))
-    kept, force = unnamed.led(WORLD, loud, [(None, finer)], True)
+    kept, force = led(WORLD, loud, [(None, finer)], True)
     assert kept == finer and force["place"]["name"] == "shoulder"
-    assert unnamed.led(WORLD, loud, [(None, finer)], False) == [finer]
+    assert led(WORLD, loud, [(None, finer)], False) == [finer]
 
 
 def places(given, something):
-    return [f["place"]["name"] for f in unnamed.led(WORLD, given, [], something)]
+    return [f["place"]["name"] for f in led(WORLD, given, [], something)]
 
 
 def test_a_force_without_a_name_is_told_only_where_a_perfect_simulator_is_worth_its_price():
@@ -185,7 +205,7 @@ def test_what_held_out_recordings_do_not_show_the_located_force_has_to():
 def test_an_unknown_force_names_the_variables_that_it_follows_best():
     some = [("elbow", ("time",)), ("shoulder", ("position:elbow",)), ("elbow", ("time", "x"))]
     some += [("elbow", ("y", "z"))]
-    [only] = unnamed.led(WORLD, outcome(smoothed(0.3), depends=some, gains=(0, 1)), [], True)
+    [only] = led(WORLD, outcome(smoothed(0.3), depends=some, gains=(0, 1)), [], True)
     assert only["depends_on"] == ["time", "x", "y"]
 
 
@@ -193,19 +213,19 @@ def test_what_kept_back_recordings_spoke_against_is_an_unknown_force_at_its_join
     loud = smoothed(0.3, shoulder=0.9)
     elsewhere = [d for d in DEPENDS if d[0] == "shoulder"]
     given = outcome(loud, depends=elsewhere, gone=[FRICTION])
-    [only] = unnamed.led(WORLD, given, [], False)
+    [only] = led(WORLD, given, [], False)
     assert (only["effect"], only["place"]["name"]) == ("unknown", "elbow")
     assert only["depends_on"] == ["velocity:elbow"] and not only["adequate"]
-    [only] = unnamed.led(WORLD, outcome(loud, depends=DEPENDS, gone=[FRICTION]), [], False)
+    [only] = led(WORLD, outcome(loud, depends=DEPENDS, gone=[FRICTION]), [], False)
     assert only["depends_on"] == ["velocity:elbow", "position:elbow"]  # what it leaves as well
-    kept = unnamed.led(WORLD, outcome(loud, 0.1, gone=[FRICTION]), [finding(MASS)], False)
+    kept = led(WORLD, outcome(loud, 0.1, gone=[FRICTION]), [finding(MASS)], False)
     assert [f["effect"] for f in kept] == ["mass"]
     curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))  # tried, and never earned
-    assert unnamed.led(WORLD, outcome(loud, gone=[curve]), [], False) == []
+    assert led(WORLD, outcome(loud, gone=[curve]), [], False) == []
 
 
 def test_what_lies_within_the_noise_says_nothing_against_a_name():
-    [only] = unnamed.led(WORLD, outcome(smoothed(0.1), np.nan), [finding(MASS)], True)
+    [only] = led(WORLD, outcome(smoothed(0.1), np.nan), [finding(MASS)], True)
     assert only["effect"] == "mass" and only["adequate"]
     assert only["evidence"]["error_left"] is None
 
@@ -213,6 +233,6 @@ def test_what_lies_within_the_noise_says_nothing_against_a_name():
 def test_a_value_at_the_edge_of_what_was_tried_is_no_name():
     edge = plausible(FRICTION, USUAL).high[0]
     given = outcome(smoothed(1.0), 0.1, DEPENDS, friction=edge)
-    [only] = unnamed.led(WORLD, given, [finding(FRICTION)], True)
+    [only] = led(WORLD, given, [finding(FRICTION)], True)
     assert only["effect"] == "unknown"
     assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
