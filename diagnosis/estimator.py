@@ -8,7 +8,7 @@ held-out ones are only predicted.
 """
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,10 +77,11 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     event = transients.happened(world, train, found)
     if event and not plausible(event.candidate, found.usual).inside(np.array(event.values)):
         event = None
-    if event:  # what lasts is searched again where it was not disturbed
+    if event:  # what lasts is searched again where it was not disturbed, from what was found
         log(f"  an event: {event.candidate}")
         search = Identification(world, transients.calm(train, event), say, log)
-        found = search.run()
+        found = search.run(found.fitted.setting)
+        found = replace(found, fitted=_earned(search, found.judge, found.fitted))
     say(0.75, "what could stand in a finding's place")
     fitted, others = _classes(search, found, found.fitted, log, search.candidates)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
@@ -97,6 +98,13 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         _nameless(search, outcome)
     say(0.95, "held-out error")
     return findings.assemble(world, train, held_out, outcome)
+
+
+def _earned(search, judge, fitted):
+    """A Fitted set without what is not earned beside the rest, or over nothing."""
+    nothing = judge.fit({})
+    fitted = search.pruned(judge, fitted, nothing)
+    return fitted if search.earned(nothing, fitted) else nothing
 
 
 def _checked(search, found, fitted, others, log):
@@ -264,9 +272,7 @@ def _hand_over(search, held, kept_back, outcome, log):
             fitted, told = plain, {}
         told, still = {**outcome.others, **told}, set(pool) - set(fitted.setting)
         outcome.others = {c: [o for o in told[c] if o[0] in still] for c in told}
-        nothing = judge.fit({})
-        fitted = search.pruned(judge, fitted, nothing)  # and what was earned beside it, not alone
-        return fitted.setting if search.earned(nothing, fitted) else {}
+        return _earned(search, judge, fitted).setting  # what was earned beside it goes, too
 
     outcome.handed = accepted(world, decides, setting, refit, log, told=check)
     kept = outcome.handed.setting

@@ -115,6 +115,48 @@ def test_a_push_for_a_while_is_placed_in_time():
     assert finding["when"]["time"] == pytest.approx([1.5, 2.5], abs=0.1)
 
 
+class Ended(Exception):
+    """What a test is after has been seen."""
+
+
+def test_after_an_event_the_search_goes_on_from_what_was_found(monkeypatch):
+    """Where little is left beside it, a search from nothing may end anywhere."""
+    begun, friction = [], {"friction": (0.1,)}
+    train = [recorded("run.csv", 0)]
+
+    class Search:
+        def __init__(self, world, train, say, log):
+            self.train = train
+
+        def run(self, setting=None):
+            begun.append((self.train, setting))
+            return SimpleNamespace(fitted=SimpleNamespace(setting=friction), usual=None, judge=None)
+
+    def earned(*given):
+        raise Ended
+
+    event = SimpleNamespace(candidate="push", values=(1.0,))
+    monkeypatch.setattr(estimator, "Identification", Search)
+    monkeypatch.setattr(estimator.transients, "happened", lambda world, train, found: event)
+    monkeypatch.setattr(estimator.transients, "calm", lambda train, event: "calm")
+    possible = SimpleNamespace(inside=lambda values: True)
+    monkeypatch.setattr(estimator, "plausible", lambda candidate, usual: possible)
+    monkeypatch.setattr(estimator, "_earned", earned)
+    with pytest.raises(Ended):
+        identify(None, train, [])
+    assert begun == [(train, None), ("calm", friction)]
+
+
+@pytest.mark.parametrize("worth", [True, False])
+def test_what_is_kept_is_earned_over_nothing(worth):
+    judge = SimpleNamespace(fit=lambda setting: "nothing")
+    search = SimpleNamespace(
+        pruned=lambda judge, fitted, now: f"{fitted}, pruned", earned=lambda before, after: worth
+    )
+    kept = estimator._earned(search, judge, "friction")
+    assert kept == ("friction, pruned" if worth else "nothing")
+
+
 def test_recordings_without_positions_are_refused():
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     run = recorded("run.csv", 0)
