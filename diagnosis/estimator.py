@@ -113,13 +113,14 @@ def _checked(search, found, fitted, others, log):
     dependences = unmodelled_force.dependences(world, found.first, train, most=None)
     trajectory = found.trajectory
     left = unmodelled_force.dependences(world, trajectory, train, most=None)
+    shares = share_left(fitted) if fitted.setting else None
     finer = None  # what finer steps explain as well is no force
     for rest in unmodelled_force.each_joint(left)[:2]:
-        finer = finer or search.finer(judge, fitted)
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         dof = world.model.joint(rest.joint).dofadr[0]
-        if mine and not share_left(fitted)[channel(fitted, dof)] > NEAREST:
+        if mine and not shares[channel(fitted, dof)] > NEAREST:
             continue
+        finer = finer or search.finer(judge, fitted)
         # where no name is found, all that is told are a joint and a variable
         units = complexity([rest.candidate]) if mine else UNNAMED
         tries = [_beside(search, judge, finer, rest, PRICE * units)]

@@ -27,9 +27,9 @@ def likely(missing, starts):
     """
     chain, setting = missing.chain, missing.setting
     touches = 2 * len(chain.used) < len(chain.begin)
-    chosen = [start.candidate in setting or start.merges for start in starts]
-    kept = [start for start, known in zip(starts, chosen) if known]
-    new = [start for start, known in zip(starts, chosen) if not known]
+    chosen = lambda start: start.candidate in setting or start.merges
+    kept = [start for start in starts if chosen(start)]
+    new = [start for start in starts if not chosen(start)]
     in_rows, in_windows, some = [], [], []
     rounds = len(chain.channels) + MORE
     for start in new:
@@ -40,7 +40,7 @@ def likely(missing, starts):
         some = _by_rows(missing.force, {s: b for s, b in bases.items() if b is not None}, rounds)
     if in_windows:
         some += _by_windows(chain.beginnings(*GLANCES), setting, kept, in_windows, rounds)
-    return kept + some
+    return [*dict.fromkeys([*kept, *some])]  # a wave may be among the best in windows as well
 
 
 def _best(gains, kept):

@@ -83,7 +83,7 @@ DEPENDS = [("elbow", ("position:elbow", "velocity:elbow")), ("shoulder", ("time"
 @pytest.mark.parametrize(
     "after, effect, adequate",
     [
-        (0.1, "coulomb_friction", True),  # no more than the noise
+        (0.1, "coulomb_friction", True),
         (0.2, "coulomb_friction", True),
         (0.4, "unknown", False),  # the nearest name
         (0.7, "unknown", False),

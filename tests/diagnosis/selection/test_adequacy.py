@@ -41,10 +41,10 @@ def test_a_missing_force_is_lacking():
 def test_a_name_leaves_what_it_does_not_explain():
     """The error of a damping that is twice its model's, as a name for it explains all, half, or
     next to none."""
-    damping, length = ("viscous_damping", "pivot"), ("stiffness", "pivot")
+    damping, spring = ("viscous_damping", "pivot"), ("stiffness", "pivot")
     shares = [
         float(share_left(judged(0, told, damping=0.1))[0])
-        for told in (None, {length: (1e-4,)}, {damping: (0.075,)}, {damping: (0.1,)})
+        for told in (None, {spring: (1e-4,)}, {damping: (0.075,)}, {damping: (0.1,)})
     ]
     assert shares[0] == 1.0 and shares[1] == pytest.approx(1.0, abs=0.05)
     assert shares[2] == pytest.approx(0.5, abs=0.1) and shares[3] < 0.1
