@@ -77,11 +77,8 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     event = transients.happened(world, train, found)
     if event and not plausible(event.candidate, found.usual).inside(np.array(event.values)):
         event = None
-    if event:  # what lasts is searched again where it was not disturbed, from what was found
-        log(f"  an event: {event.candidate}")
-        search = Identification(world, transients.calm(train, event), say, log)
-        found = search.run(found.fitted.setting)
-        found = replace(found, fitted=_earned(search, found.judge, found.fitted))
+    if event:
+        search, found, event = _undisturbed(search, found, event)
     say(0.75, "what could stand in a finding's place")
     fitted, others = _classes(search, found, found.fitted, log, search.candidates)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
@@ -98,6 +95,35 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         _nameless(search, outcome)
     say(0.95, "held-out error")
     return findings.assemble(world, train, held_out, outcome)
+
+
+def _undisturbed(search, found, event):
+    """(search, found, event): what lasts, searched again where an event did not disturb it, from
+    what was found. That has to predict no worse than this, beside the event, where it did; and
+    neither is kept that predicts worse so than what was found without an event."""
+    search.log(f"  an event: {event.candidate}")
+    calm = Identification(
+        search.world, transients.calm(search.train, event), search.say, search.log
+    )
+    again = calm.run(found.fitted.setting)
+    again = replace(again, fitted=_earned(calm, again.judge, again.fitted))
+    before, after = (
+        _everywhere(search, found.judge, some.fitted.setting, event) for some in (found, again)
+    )
+    search.log(f"  beside it {before:.3f}, {after:.3f}; {found.fitted.loss:.3f} without")
+    if min(before, after) >= found.fitted.loss:
+        return search, found, None
+    if before < after:
+        again = replace(again, fitted=again.judge.fit(found.fitted.setting))
+    return calm, again, event
+
+
+def _everywhere(search, judge, setting, event):
+    """The loss of a setting beside an event on all windows, without the event's price, which it is
+    worth where it acts."""
+    both = {**setting, event.candidate: event.values}
+    fitted = search.begun(judge, both).fit(both, steps=0)
+    return fitted.loss - PRICE * complexity([event.candidate])
 
 
 def _earned(search, judge, fitted):

@@ -71,6 +71,11 @@ class Chain(Ahead):
         self.contacts = self._begun([self.windows[i] for i in self.touched], touching)
         self.travel = np.where(touched[:, None, None], self.whole.travel, np.inf)
 
+    @property
+    def touches(self):
+        """Whether the motion mostly touches something."""
+        return 2 * len(self.used) < len(self.begin)
+
     def beginnings(self, number, seconds):
         """A Chain of the first seconds of so many of the windows, evenly chosen, which simulates an
         effect once for all starts: a motion that is located anew hardly moves."""

@@ -26,14 +26,13 @@ def likely(missing, starts):
     are those most like the located force already.
     """
     chain, setting = missing.chain, missing.setting
-    touches = 2 * len(chain.used) < len(chain.begin)
     chosen = lambda start: start.candidate in setting or start.merges
     kept = [start for start in starts if chosen(start)]
     new = [start for start in starts if not chosen(start)]
     in_rows, in_windows, some = [], [], []
     rounds = len(chain.channels) + MORE
     for start in new:
-        (in_windows if touches or chain.apart(start.candidate) else in_rows).append(start)
+        (in_windows if chain.touches or chain.apart(start.candidate) else in_rows).append(start)
     if in_rows:
         bases = {start: missing.basis(start) for start in in_rows}
         in_windows += [start for start in in_rows if bases[start] is None]
@@ -44,14 +43,14 @@ def likely(missing, starts):
 
 
 def _best(gains, kept):
-    """(the best of {Start: gain}, further Starts to be kept beside some): of the best candidates
-    that are not kept yet the best in proportion and the best of its whole values."""
+    """(the best of {Start: gain}, further Starts to be kept beside some): the best one of each of
+    the best candidates that are not kept yet."""
     order = sorted(gains, key=lambda start: -gains[start])
     best, known = {}, {start.candidate for start in kept}
     for start in order:
         if start.candidate not in known:
-            best.setdefault(start.candidate, {}).setdefault(start.whole, start)
-    return order[0], [start for each in list(best.values())[:EACH] for start in each.values()]
+            best.setdefault(start.candidate, start)
+    return order[0], list(best.values())[:EACH]
 
 
 def _by_rows(target, bases, rounds):

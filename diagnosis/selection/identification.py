@@ -164,7 +164,8 @@ class Identification:
         is of no use, whatever of it is not needed."""
         others = [c for c in self.candidates if c not in setting]
         every, curves = [*setting, *others], self._curves(setting)
-        starts = Starts(self.world, setting, self.usual, self.seen, self.trajectory)
+        known = self.usual, self.seen, self.trajectory, self.screen.touches
+        starts = Starts(self.world, setting, *known)
         self.missing = missing = MissingForce(self.screen, setting, self.missing)
         some = likely(missing, starts.of(every))
         some += [starts.curve(*curve) for curve in curves]

@@ -38,11 +38,6 @@ class Start:
     prior: object
     merges: bool = False
 
-    @property
-    def whole(self):
-        """Whether these are whole values, of which no small share says anything."""
-        return bool((self.low > 0).any())
-
     def settings(self, setting):
         """A setting with each of the directions."""
         return [{**setting, self.candidate: tuple(self.base + row)} for row in self.directions]
@@ -51,11 +46,12 @@ class Start:
 class Starts:
     """Where effects are begun beside a setting."""
 
-    def __init__(self, world, setting, usual, seen=None, trajectory=None):
+    def __init__(self, world, setting, usual, seen=None, trajectory=None, touches=False):
         """usual: a Usual; seen: {candidate: which of its parameters show}; trajectory: along which
-        starts that come in groups are compared with the located force, and few of them kept."""
+        starts that come in groups are compared with the located force, and few of them kept;
+        touches: whether the motion mostly touches something."""
         self.world, self.setting, self.usual = world, setting, usual
-        self.seen, self.trajectory = seen or {}, trajectory
+        self.seen, self.trajectory, self.touches = seen or {}, trajectory, touches
 
     def of(self, candidates):
         """[Start] of all the candidates."""
@@ -72,6 +68,7 @@ class Starts:
             if inside:
                 return out
             whole = list(world.far(candidate, recordings)) + _ladder(base, prior)
+            whole += _both_ways(base, prior) if self.touches else []
         else:
             out, whole = [], _begun(candidate, world.probes(candidate, recordings), prior)
         together = candidate.effect.together
@@ -153,6 +150,14 @@ def _ladder(base, prior):
     if len(base) > 1 or base[0] > prior.low[0] or not np.isfinite(prior.scale[0]):
         return []
     return [base + share * prior.scale for share in LADDER]
+
+
+def _both_ways(base, prior):
+    """A usual size of each parameter that may go either way: where something touches, a small step
+    tells of what it makes and breaks."""
+    usual = np.where(np.isfinite(prior.scale) & (base > prior.low), prior.scale, 0.0)
+    rows = np.diag(usual)[usual > 0]
+    return [base + way * row for row in rows for way in (-1, 1)]
 
 
 def _proportional(candidate, base, prior, shown):

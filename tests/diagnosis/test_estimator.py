@@ -10,6 +10,7 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 from diagnosis import estimator
 from diagnosis.estimator import identify
 from diagnosis.recordings.recording import RecordingError
+from diagnosis.selection.criterion import PRICE, complexity
 from diagnosis.simulation.simulator import World
 
 
@@ -115,36 +116,62 @@ def test_a_push_for_a_while_is_placed_in_time():
     assert finding["when"]["time"] == pytest.approx([1.5, 2.5], abs=0.1)
 
 
-class Ended(Exception):
-    """What a test is after has been seen."""
+class Set(SimpleNamespace):
+    """A Fitted set: its setting and loss."""
 
 
-def test_after_an_event_the_search_goes_on_from_what_was_found(monkeypatch):
-    """Where little is left beside it, a search from nothing may end anywhere."""
-    begun, friction = [], {"friction": (0.1,)}
-    train = [recorded("run.csv", 0)]
+class Search:
+    """A search that ends with less friction where it is begun in calm recordings, and an event
+    beside which either predicts as a test says."""
 
-    class Search:
-        def __init__(self, world, train, say, log):
-            self.train = train
+    trajectory = usual = judge = None
 
-        def run(self, setting=None):
-            begun.append((self.train, setting))
-            return SimpleNamespace(fitted=SimpleNamespace(setting=friction), usual=None, judge=None)
+    def __init__(self, world, train, say=None, log=None):
+        self.world, self.train, self.say, self.log = world, train, say, log or (lambda line: None)
 
-    def earned(*given):
-        raise Ended
+    def run(self, setting):
+        self.begun_with = setting
+        ended = Set(setting={"friction": 0.2}, loss=0.0)
+        return estimator.Found(ended, *[None] * 4, SimpleNamespace(fit=self.refitted), *[None] * 3)
 
-    event = SimpleNamespace(candidate="push", values=(1.0,))
+    def refitted(self, setting):
+        return Set(setting=setting, loss=0.0)
+
+    def begun(self, judge, setting):
+        priced = judge[setting["friction"]] + PRICE * complexity([PUSH.candidate])
+        return SimpleNamespace(fit=lambda setting, steps: Set(loss=priced))
+
+
+class Push:
+    effect = SimpleNamespace(simplicity=1)
+    parameters = range(3)
+
+
+PUSH = SimpleNamespace(candidate=Push(), values=(1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "beside, event, friction",
+    [
+        ({0.1: -2.0, 0.2: -3.0}, PUSH, 0.2),  # what the search in calm recordings ended with
+        ({0.1: -3.0, 0.2: -2.0}, PUSH, 0.1),  # that predicts worse than what was found before
+        ({0.1: -0.5, 0.2: -0.9}, None, 0.1),  # and neither is better for the event
+    ],
+)
+def test_what_lasts_is_searched_again_where_an_event_is_not(monkeypatch, beside, event, friction):
     monkeypatch.setattr(estimator, "Identification", Search)
-    monkeypatch.setattr(estimator.transients, "happened", lambda world, train, found: event)
     monkeypatch.setattr(estimator.transients, "calm", lambda train, event: "calm")
-    possible = SimpleNamespace(inside=lambda values: True)
-    monkeypatch.setattr(estimator, "plausible", lambda candidate, usual: possible)
-    monkeypatch.setattr(estimator, "_earned", earned)
-    with pytest.raises(Ended):
-        identify(None, train, [])
-    assert begun == [(train, None), ("calm", friction)]
+    monkeypatch.setattr(estimator, "_earned", lambda search, judge, fitted: fitted)
+    before = Set(setting={"friction": 0.1}, loss=-1.0)
+    found = estimator.Found(before, *[None] * 4, beside, *[None] * 3)
+    whole = Search("world", "all of it")
+    search, ended, told = estimator._undisturbed(whole, found, PUSH)
+    assert told is event and ended.fitted.setting == {"friction": friction}
+    if event:
+        assert (search.world, search.train) == ("world", "calm")
+        assert search.begun_with == {"friction": 0.1}  # begun at nothing it may end anywhere
+    else:
+        assert search is whole and ended is found
 
 
 @pytest.mark.parametrize("worth", [True, False])

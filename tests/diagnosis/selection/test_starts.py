@@ -41,6 +41,30 @@ def test_a_stop_on_one_side_has_a_step_for_that_side_alone(machine):
     assert (start.directions != 0).tolist() == [[True, False]]
 
 
+@pytest.mark.parametrize("effect, begun", [("mass", 3), ("center_of_mass", 7), ("gain", 3)])
+def test_where_something_touches_usual_sizes_are_tried_both_ways(machine, effect, begun):
+    """A small step tells of what it makes and breaks."""
+    world, usual = machine
+    candidate = next(c for c in world.candidates if c.effect.name == effect)
+    far = len(world.far(candidate, usual.recordings))
+    free = Starts(world, {}, usual).of([candidate])
+    starts = Starts(world, {}, usual, touches=True).of([candidate])
+    assert len(free) == 1 + far and len(starts) == begun + far
+    scale, base = plausible(candidate, usual).scale, np.array(candidate.nominal)
+    values = {tuple(np.round(s.base + row, 9)) for s in starts for row in s.directions}
+    for row in np.diag(scale):
+        assert {tuple(np.round(base + way * row, 9)) for way in (-1, 1)} <= values
+    inside = Starts(world, {candidate: candidate.nominal}, usual, touches=True).of([candidate])
+    assert len(inside) == 1
+
+
+def test_what_goes_one_way_is_not_tried_the_other(machine):
+    world, usual = machine
+    friction = world.candidate("coulomb_friction", "pivot")
+    count = lambda touches: len(Starts(world, {}, usual, touches=touches).of([friction]))
+    assert count(True) == count(False)
+
+
 def test_a_friction_map_begins_at_the_wave_of_the_located_force(machine):
     world, usual = machine
     friction = world.candidate("friction_map", "pivot")
