@@ -31,13 +31,12 @@ CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 @dataclass(frozen=True)
 class Dependence:
     """share: of the located force's variance at the joint that the curve predicts in stretches left
-    out; size: RMS of so much of it; candidate, values: the curve and the forces at its knots;
-    above: size over the standard deviation of the located force."""
+    out; candidate, values: the curve and the forces at its knots; above: RMS of so much of it over
+    the standard deviation of the located force."""
 
     joint: str
     variables: tuple
     share: float
-    size: float
     candidate: object
     values: tuple
     above: float = 0.0
@@ -79,8 +78,8 @@ def dependences(world, trajectory, recordings, most=4, rows=True):
                         candidate = world.curve(name, variable, curve.knots, factor, wave)
                         told = candidate.effect.depends_on
                         values, above = tuple(map(float, curve.values)), curve.rms / scatter[d]
-                        of = curve.share, curve.rms
-                        found.append(Dependence(name, told, *of, candidate, values, above))
+                        of = name, told, curve.share
+                        found.append(Dependence(*of, candidate, values, above))
     return sorted(found, key=lambda each: -each.above)[:most]
 
 

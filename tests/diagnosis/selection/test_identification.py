@@ -31,7 +31,7 @@ def curves_of(search, monkeypatch, setting):
         ("elbow", ("time", "velocity:elbow")),
         ("shoulder", ("position:shoulder",)),
     ]
-    located = [Dependence(joint, told, 0.9, 1.0, (joint, told), ()) for joint, told in four]
+    located = [Dependence(joint, told, 0.9, (joint, told), ()) for joint, told in four]
     monkeypatch.setattr(identification, "dependences", lambda *args, most: located)
     return [candidate for candidate, _ in search._curves(setting)]
 
@@ -272,7 +272,7 @@ def leaves(search, names, loss, angle):
 def begun_elsewhere(search, monkeypatch, above, ended=("viscous_damping",), curve=1.0):
     """First effects of the sets from which a search begins again that ended with some; curve: loss
     of a set without a name."""
-    left = [Dependence("elbow", ("time",), 0.9, 1.0, None, (), above)] if above else []
+    left = [Dependence("elbow", ("time",), 0.9, None, (), above)] if above else []
     monkeypatch.setattr(identification, "dependences", lambda *args, most: left)
     search.judged = [
         leaves(search, ["coulomb_friction"], -1.0, 60),
