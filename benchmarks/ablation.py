@@ -32,6 +32,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no correction for the number looked at": {"diagnosis.selection.identification:LEVEL": 1.0},
     "a beam of one": {"diagnosis.selection.beam:WIDTH": 1},
     "no values at full size": {"diagnosis.selection.starts:LADDER": ()},
+    "small steps alone where something touches": {"diagnosis.selection.starts:WAYS": ()},
     "no second look at the values that suit": {"diagnosis.selection.columns:SECANTS": 0},
     "no classes": {"diagnosis.selection.rivals:REFITS": 0},
     "no sets carried on": {"diagnosis.selection.rivals:SETS": 0},

@@ -16,6 +16,7 @@ FULL = 0.3, 3.0  # amounts of a whole start of values, within which a column sta
 PROBES = 12  # starts of one candidate that are looked at, but for those that come in groups
 LADDER = 0.1, 0.4  # shares of a prior's scale
 BEGUN = 0.1  # share of an amplitude's scale, at which effects of several values are begun
+WAYS = -1, 1  # in which a usual size is tried where something touches
 STATES = 300  # of the motion, at which forces are compared
 NEARER = 0.5, 0.25  # of the way to the next group of starts, by which the best is moved
 STEP = 0.03  # share of a value's prior scale, or its way from nominal, that a step is at least
@@ -157,7 +158,7 @@ def _both_ways(base, prior):
     tells of what it makes and breaks."""
     usual = np.where(np.isfinite(prior.scale) & (base > prior.low), prior.scale, 0.0)
     rows = np.diag(usual)[usual > 0]
-    return [base + way * row for row in rows for way in (-1, 1)]
+    return [base + way * row for row in rows for way in WAYS]
 
 
 def _proportional(candidate, base, prior, shown):
