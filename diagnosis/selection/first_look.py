@@ -43,14 +43,14 @@ def likely(missing, starts):
 
 
 def _best(gains, kept):
-    """(the best of {Start: gain}, further Starts to be kept beside some): the best one of each of
-    the best candidates that are not kept yet."""
+    """(the best of {Start: gain}, further Starts to be kept beside some): of the best candidates
+    that are not kept yet the best in proportion and the best of its whole values."""
     order = sorted(gains, key=lambda start: -gains[start])
     best, known = {}, {start.candidate for start in kept}
     for start in order:
         if start.candidate not in known:
-            best.setdefault(start.candidate, start)
-    return order[0], list(best.values())[:EACH]
+            best.setdefault(start.candidate, {}).setdefault(start.whole, start)
+    return order[0], [start for each in list(best.values())[:EACH] for start in each.values()]
 
 
 def _by_rows(target, bases, rounds):

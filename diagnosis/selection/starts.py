@@ -39,6 +39,11 @@ class Start:
     prior: object
     merges: bool = False
 
+    @property
+    def whole(self):
+        """Whether these are whole values, of which no small share says anything."""
+        return bool((self.low > 0).any())
+
     def settings(self, setting):
         """A setting with each of the directions."""
         return [{**setting, self.candidate: tuple(self.base + row)} for row in self.directions]
