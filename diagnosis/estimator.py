@@ -98,9 +98,9 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
 
 
 def _undisturbed(search, found, event):
-    """(search, found, event): what lasts, searched again where an event did not disturb it, from
-    what was found. That has to predict no worse than this, beside the event, where it did; and
-    neither is kept that predicts worse so than what was found without an event."""
+    """(search, found, event): what lasts, searched again without the time of an event, begun with
+    what was found. Beside the event, on all windows, the better of the two sets is kept; where
+    neither predicts better than what was found without an event, there is none."""
     search.log(f"  an event: {event.candidate}")
     calm = Identification(
         search.world, transients.calm(search.train, event), search.say, search.log

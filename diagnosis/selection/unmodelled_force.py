@@ -78,8 +78,7 @@ def dependences(world, trajectory, recordings, most=4, rows=True):
                         candidate = world.curve(name, variable, curve.knots, factor, wave)
                         told = candidate.effect.depends_on
                         values, above = tuple(map(float, curve.values)), curve.rms / scatter[d]
-                        of = name, told, curve.share
-                        found.append(Dependence(*of, candidate, values, above))
+                        found.append(Dependence(name, told, curve.share, candidate, values, above))
     return sorted(found, key=lambda each: -each.above)[:most]
 
 

@@ -121,10 +121,8 @@ class Set(SimpleNamespace):
 
 
 class Search:
-    """A search that ends with less friction where it is begun in calm recordings, and an event
-    beside which either predicts as a test says."""
-
-    trajectory = usual = judge = None
+    """A search that ends with a friction of 0.2; judge: the loss of each friction on all windows,
+    beside an event whose price is not counted."""
 
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train, self.say, self.log = world, train, say, log or (lambda line: None)

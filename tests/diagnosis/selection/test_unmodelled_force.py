@@ -8,7 +8,7 @@ import pytest
 
 from diagnosis.estimation.smoother import Trajectory
 from diagnosis.recordings.recording import Recording
-from diagnosis.selection.unmodelled_force import LEAST, _explained, dependences, places_of
+from diagnosis.selection.unmodelled_force import CLIP, LEAST, _explained, dependences, places_of
 from diagnosis.simulation.simulator import World
 
 ARM = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
@@ -83,9 +83,14 @@ def test_a_friction_that_its_drive_lessens_depends_on_control_and_on_the_sign_of
 
 def test_a_ripple_that_grows_with_speed_depends_on_position_and_velocity():
     law = lambda q, v, u, t: at(0, 0.1 * v[:, 0] ** 2 * np.sin(9 * q[:, 0]))
-    found = dependences(*made_up(law))[0]
+    world, trajectory, runs = made_up(law)
+    found = dependences(world, trajectory, runs)[0]
     assert found.variables == ("position:j", "velocity:j") and found.share > 0.7
     assert found.candidate.effect.factor == "speed:j" and found.candidate.effect.wave
+    force, scatter = trajectory.force[~trajectory.free, 0], trajectory.located()[1][0]
+    most = CLIP * 1.4826 * np.median(abs(force))
+    size = np.sqrt(found.share * np.mean(np.clip(force, -most, most) ** 2))
+    assert found.above == pytest.approx(size / scatter)
 
 
 def test_ripples_of_what_a_drive_is_asked_for_are_a_wave_times_its_control():
