@@ -5,6 +5,7 @@ for line in audit("results/proof_final.csv", "results/final.seals", redraw=20): 
 
 import json
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 from diagnosis.trials.drawing import draw_trial
@@ -47,8 +48,10 @@ def audit(table, seals, redraw=None, jobs=1):
     yield f"{len(rows)} rows: every key is the one that was sealed, every score follows the rules"
     redraw = len(rows) if redraw is None else redraw
     chosen = rows[:: max(1, len(rows) // max(1, redraw))][:redraw]
-    with ProcessPoolExecutor(jobs) as pool:
-        for row, answer in zip(chosen, pool.map(redrawn, chosen)):
+    settings = [SETTINGS[row["settings"]] for row in chosen]
+    # a fork would copy the locks of this process's threads, and wait for ever on one that is held
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for row, answer in zip(chosen, pool.map(redrawn, chosen, settings)):
             if not alike(answer, json.loads(row["answer"])):
                 raise SealError(f"trial {row['number']}: drawn again, it hides something else")
     yield f"{len(chosen)} trials drawn again: the same answers"
@@ -88,10 +91,10 @@ def check_row(row, published, commit):
             raise SealError(f"trial {number}: {name} is {row[name]}, by the rules {again[name]}")
 
 
-def redrawn(row):
-    """The answer of a row's trial, drawn again."""
+def redrawn(row, settings):
+    """The answer of a row's trial, drawn again by its Settings."""
     key = trial_key(row["seals"], row["key"], int(row["number"]))
-    return json.loads(json.dumps(draw_trial(key, SETTINGS[row["settings"]]).answer))
+    return json.loads(json.dumps(draw_trial(key, settings).answer))
 
 
 def alike(one, other):
