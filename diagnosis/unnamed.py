@@ -13,7 +13,7 @@ from diagnosis.effects.base import HINGE, JOINT_TRANSMISSIONS, SLIDE, is_numeric
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation import windowing
 from diagnosis.selection.adequacy import channel, share_left
-from diagnosis.selection.criterion import PRICE
+from diagnosis.selection.criterion import BEYOND, PRICE
 from diagnosis.selection.identification import LEVEL
 from diagnosis.selection.plausibility import at_limit, plausible
 from diagnosis.selection.unmodelled_force import ABOVE
@@ -47,10 +47,10 @@ def main_joint(world, outcome, candidate, shares):
 
 def held_out_share(errors):
     """Share of the nominal model's held-out error of a channel that is left, both beyond a perfect
-    simulator's; infinite where it shows nothing. errors: {"before", "after", "floor"}."""
+    simulator's; NaN where it shows hardly more than that. errors: {"before", "after", "floor"}."""
     before, after, floor = (errors[key] for key in ("before", "after", "floor"))
-    if not np.isfinite([before, after]).all() or before <= floor:
-        return np.inf
+    if not before > BEYOND * floor or not np.isfinite([before, after]).all():
+        return np.nan
     return np.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
 
 
@@ -154,7 +154,7 @@ def led(world, outcome, findings, something, channels):
     name: a finer time step is none.
 
     findings: [(candidate or None, finding)], the most important first; channels {channel: errors}:
-    of held-out recordings. What these show to be explained is, whatever the others leave.
+    of held-out recordings. Where these show what is missing, they say how much of it is left.
     """
     # of two at a joint the more important one: what acts at times may stand beside a curve
     leads = {f["place"]["name"]: f for _, f in reversed(findings) if f["effect"] == "unknown"}
@@ -165,7 +165,8 @@ def led(world, outcome, findings, something, channels):
         if candidate and joint is None:
             at, share = main_joint(world, outcome, candidate, shares)
             if f"qpos:{at}" in channels:
-                share = min(share, held_out_share(channels[f"qpos:{at}"]))
+                shown = held_out_share(channels[f"qpos:{at}"])
+                share = shown if np.isfinite(shown) else share
             told = share if np.isfinite(share) else None
             finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
             edge = _at_edge(outcome, candidate)

@@ -13,13 +13,10 @@ from mujoco.batch import Batch, SimulationError
 
 from diagnosis.simulation.editable_model import BALL, FREE, Working
 from diagnosis.simulation.readout import locate, read
+from diagnosis.simulation.run_up import run_up
 from diagnosis.simulation.stepwise import Stepwise
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-RUN_UP = (
-    0.4,
-    0.1,
-)  # seconds before a window to find hidden coordinates from, and between returns to the record
 SHOTS = 5  # corrections of a start that delayed sensors show late
 
 
@@ -62,7 +59,7 @@ class Engine:
             states = qpos, qvel, act
             self._shoot(cases, recordings, begin, states, shown, early, measures, step, lead)
             count += lead
-        q, v, data, _ = self._trajectory(
+        q, v, data, _ = self.trajectory(
             cases, recordings, begin, qpos, qvel, step, count, sensors, act
         )
         time = np.full((len(cases), rows), np.nan)
@@ -80,17 +77,17 @@ class Engine:
         n, act = len(cases), None
         qpos, qvel = np.tile(self.model.qpos0, (n, 1)), np.zeros((n, self.model.nv))
         if self.model.nq > self.nominal.nq or self.hidden.any():
-            qpos, qvel, act = self._run_up(cases, windows, begin, measures, step)
-        qpos[:, self.q], qvel[:, self.v] = self._true(*shown, measures)
+            qpos, qvel, act = run_up(self, cases, windows, begin, measures, step)
+        qpos[:, self.q], qvel[:, self.v] = self.true(*shown, measures)
         return qpos, qvel, act
 
     def _shoot(self, cases, recordings, begin, states, shown, early, measures, step, lead):
         """Correct states (qpos, qvel, act) in place until delayed sensors show what they should
         `early` seconds later, within `lead` steps."""
         qpos, qvel, act = states
-        q, v = self._true(*shown, measures)
+        q, v = self.true(*shown, measures)
         for _ in range(SHOTS):
-            trial = self._trajectory(cases, recordings, begin, qpos, qvel, step, lead, act=act)
+            trial = self.trajectory(cases, recordings, begin, qpos, qvel, step, lead, act=act)
             found = read(
                 self.nominal,
                 trial[0][..., self.q],
@@ -112,7 +109,7 @@ class Engine:
         qvel[..., simple_v] *= ratio[:, None]
         return qpos, qvel
 
-    def _true(self, qpos, qvel, measures):
+    def true(self, qpos, qvel, measures):
         """Positions and velocities behind what sensors show, but for their delays."""
         (simple_q, simple_v), (offset, ratio, _) = simple(self.nominal), measures
         qpos, qvel = qpos.copy(), qvel.copy()
@@ -122,35 +119,7 @@ class Engine:
         )
         return qpos, qvel
 
-    def _run_up(self, cases, windows, begin, measures, step):
-        """States (n, ·) of the working model at `begin`, activations included, for what the
-        recording does not show of them.
-
-        From RUN_UP seconds before, always again from what was recorded, with the hidden
-        coordinates running on; at rest in the middle where nothing was recorded.
-        """
-        n = len(cases)
-        qpos, qvel = np.tile(self.model.qpos0, (n, 1)), np.zeros((n, self.model.nv))
-        act = np.zeros((n, self.model.na))
-        recordings = [w.recording for w in windows]
-        marks = [begin - back for back in np.arange(RUN_UP[0], 0.0, -RUN_UP[1])] + [begin]
-        marks = [np.maximum(t, [r.time[0] for r in recordings]) for t in marks]
-        for now, then in zip(marks[:-1], marks[1:]):
-            recorded = [recorded_state(self.nominal, r, t) for r, t in zip(recordings, now)]
-            q, v = self._true(*map(np.array, zip(*recorded)), measures)
-            known = np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1)
-            qpos[np.ix_(known, self.q)], qvel[np.ix_(known, self.v)] = q[known], v[known]
-            steps = np.rint((then - now) / step).astype(int)
-            if steps.any():
-                q, v, _, a = self._trajectory(
-                    cases, recordings, now, qpos, qvel, step, steps.max(), act=act
-                )
-                for state, run in zip((qpos, qvel, act), (q, v, a)):
-                    run = run[np.arange(n), steps]
-                    state[:] = np.where(np.isfinite(run).all(axis=1, keepdims=True), run, state)
-        return qpos, qvel, act
-
-    def _trajectory(
+    def trajectory(
         self, cases, recordings, begin, qpos, qvel, step, count, sensors=False, act=None
     ):
         """Every step from states qpos (n, nq), qvel (n, nv) of the working model at times `begin`
@@ -272,15 +241,3 @@ def simple(model):
     """Addresses in qpos and in qvel of the hinges and slides."""
     joints = ~np.isin(model.jnt_type, (FREE, BALL))
     return model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-
-
-def recorded_state(model, recording, t):
-    """qpos (nq,) and qvel (nv,) at the row nearest to time t: velocities as measured, else over the
-    rows around it."""
-    row = int(np.argmin(abs(recording.time - t)))
-    a, b, qvel = max(row - 1, 0), min(row + 1, len(recording.time) - 1), np.full(model.nv, np.nan)
-    if b > a:
-        seconds = recording.time[b] - recording.time[a]
-        mujoco.mj_differentiatePos(model, qvel, seconds, recording.qpos[a], recording.qpos[b])
-    measured = recording.qvel[row]
-    return recording.qpos[row], np.where(np.isfinite(measured), measured, qvel)

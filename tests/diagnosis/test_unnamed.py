@@ -110,11 +110,17 @@ def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequat
         (10.0, np.inf, 3.0, "unknown", None),
     ],
 )
-def test_held_out_recordings_may_show_that_a_name_is_enough(before, after, floor, effect, share):
+def test_held_out_recordings_show_whether_a_name_is_enough(before, after, floor, effect, share):
     errors = {"qpos:elbow": {"before": before, "after": after, "floor": floor}}
     given = outcome(smoothed(1.0), 0.7, DEPENDS)
     [only] = led(WORLD, given, [finding(FRICTION)], True, errors)
     assert only["effect"] == effect and only["evidence"].get("error_left") == share
+
+
+def test_a_name_that_predicts_held_out_recordings_badly_is_the_nearest():
+    errors = {"qpos:elbow": {"before": 10.0, "after": 6.0, "floor": 3.0}}
+    [only] = led(WORLD, outcome(smoothed(1.0), 0.1, DEPENDS), [finding(FRICTION)], True, errors)
+    assert only["effect"] == "unknown"
 
 
 def test_an_unknown_force_varies_with_what_its_nearest_name_does():

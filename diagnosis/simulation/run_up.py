@@ -1,0 +1,162 @@
+"""States that no recording shows, of bristles, plays and springs: found by following what was
+recorded.
+
+qpos, qvel, act = run_up(engine, cases, windows, begin, measures, step)
+
+Each case runs once through each recording and is brought back to it every RETURN seconds, while
+what is hidden runs on. Where it begins, the returns of the first SETTLE seconds tell: as with any
+observer, what is hidden shows in how far they miss.
+"""
+
+import mujoco
+import numpy as np
+
+from diagnosis.common.coordinates import difference
+
+RETURN = 0.1  # seconds between returns to the record
+SETTLE = 1.0  # seconds whose returns tell how what is hidden began
+SMALL = 0.1, 1e-6  # step of differences: share of what a hidden state moves, and at least
+
+
+def run_up(engine, cases, windows, begin, measures, step):
+    """[qpos, qvel, act] (n, ·) of an Engine's working model at times `begin` (n,) of windows, from
+    what was recorded before. measures: as Engine has them."""
+    pairs = {(id(c), id(w.recording)): s for s, (c, w) in enumerate(zip(cases, windows))}
+    order = {key: k for k, key in enumerate(pairs)}
+    own = np.array([order[id(c), id(w.recording)] for c, w in zip(cases, windows)])
+    some = list(pairs.values())
+    chosen, recordings = [cases[s] for s in some], [windows[s].recording for s in some]
+    until = [max(begin[own == k].max(), r.time[0] + SETTLE) for k, r in enumerate(recordings)]
+    rows = _together([_returns(r, t) for r, t in zip(recordings, until)])
+    follower = _Follower(engine, chosen, recordings, rows, measures[:, some], step)
+    k = (follower.time[own] <= begin[:, None] + 1e-9).sum(1) - 1
+    states = [x[own, k] for x in follower.path()]
+    recordings = [w.recording for w in windows]
+    _onward(engine, cases, recordings, follower.time[own, k], begin, states, step)
+    return states
+
+
+class _Follower:
+    """Follows recordings at their rows (n, K), each under its own case."""
+
+    def __init__(self, engine, cases, recordings, rows, measures, step):
+        self.engine, self.cases, self.recordings, self.step = engine, cases, recordings, step
+        self.time = np.array([r.time[row] for r, row in zip(recordings, rows)])
+        self.settled = max(int((self.time - self.time[:, :1] <= SETTLE).sum(1).max()) - 1, 0)
+        shown = [[_recorded(engine.nominal, r, i) for i in row] for r, row in zip(recordings, rows)]
+        shown = [engine.true(*map(np.array, zip(*each)), measures) for each in zip(*shown)]
+        self.qpos, self.qvel = (np.array(x) for x in zip(*shown))  # (K, n, ·)
+
+    def path(self):
+        """[qpos, qvel, act] (n, K, ·) of the working model at the rows."""
+        first, last = self.settled, self.time.shape[1] - 1
+        begun = self._begun(first)
+        rest, _ = self._followed([x[:, -1] for x in begun], first, last)
+        return [np.concatenate([a, b[:, 1:]], 1) for a, b in zip(begun, rest)]
+
+    def _begun(self, last):
+        """The path up to a return, with what is hidden begun where the returns are missed least."""
+        n, own = len(self.cases), hidden(self.engine)
+        path, missed = self._followed(self._at_rest(), 0, last)
+        size = [SMALL[0] * np.sqrt(np.mean(path[i][..., k] ** 2, 1)) + SMALL[1] for i, k in own]
+        begun = [np.tile(x[:, 0], (len(own), 1)) for x in path]
+        for j, (i, k) in enumerate(own):
+            begun[i][j * n : (j + 1) * n, k] += size[j]
+        moved, other = self._followed(begun, 0, last)
+        scale = np.sqrt(np.mean(missed**2, 1, keepdims=True)) + 1e-12
+        slopes = np.moveaxis((other.reshape(len(own), *missed.shape) - missed) / scale, 0, -1)
+        slopes, missed = slopes.reshape(n, -1, len(own)), (missed / scale).reshape(n, -1, 1)
+        gram = np.swapaxes(slopes, 1, 2) @ slopes
+        ridge = 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-12
+        amounts = np.swapaxes(slopes, 1, 2) @ missed
+        amounts = -np.linalg.solve(gram + ridge * np.eye(len(own)), amounts)[..., 0]
+        changes = (x.reshape(len(own), *whole.shape) - whole for x, whole in zip(moved, path))
+        return [
+            whole + np.einsum("nh,hnks->nks", amounts, change)
+            for whole, change in zip(path, changes)
+        ]
+
+    def _at_rest(self):
+        """States at the first rows: what is hidden is at rest in the middle."""
+        n, model = len(self.cases), self.engine.model
+        qpos, qvel = np.tile(model.qpos0, (n, 1)), np.zeros((n, model.nv))
+        self._return(qpos, qvel, self.qpos[0], self.qvel[0])
+        return [qpos, qvel, np.zeros((n, model.na))]
+
+    def _followed(self, states, first, last):
+        """([qpos, qvel, act] (m, K, ·) from return `first` to `last`, how far each return missed
+        (m, K, nv)), from states (m, ·), m some times n. What a position is off tells how far the
+        velocity was."""
+        engine, times = self.engine, len(states[0]) // len(self.cases)
+        cases, recordings = self.cases * times, self.recordings * times
+        states, time = [x.copy() for x in states], np.tile(self.time, (times, 1))
+        path = [np.repeat(x[:, None], last - first + 1, 1) for x in states]
+        missed = np.zeros((len(cases), last - first + 1, engine.nominal.nv))
+        for k in range(first + 1, last + 1):
+            now, then = time[:, k - 1], time[:, k]
+            _onward(engine, cases, recordings, now, then, states, self.step)
+            qpos = np.tile(self.qpos[k], (times, 1))
+            gap = difference(engine.nominal, states[0][:, engine.q], qpos)
+            seconds = np.maximum(then - now, self.step)[:, None]
+            on = (then > now)[:, None]
+            qvel = states[1][:, engine.v] + np.where(on, gap / seconds, 0.0)
+            missed[:, k - first] = np.where(on & np.isfinite(gap), gap, 0.0)
+            self._return(*states[:2], qpos, qvel)
+            for whole, state in zip(path, states):
+                whole[:, k - first] = state
+        return path, missed
+
+    def _return(self, qpos, qvel, shown_qpos, shown_qvel):
+        """Bring states back to what is shown, where it is known."""
+        known = np.isfinite(shown_qpos).all(1) & np.isfinite(shown_qvel).all(1)
+        qpos[np.ix_(known, self.engine.q)] = shown_qpos[known]
+        qvel[np.ix_(known, self.engine.v)] = shown_qvel[known]
+
+
+def hidden(engine):
+    """[(0, 1 or 2: qpos, qvel or act; index)] of an Engine's states that a recording does not
+    show."""
+    shown = engine.q, engine.v, np.flatnonzero(~engine.hidden)
+    sizes = engine.model.nq, engine.model.nv, engine.model.na
+    return [(i, k) for i in range(3) for k in range(sizes[i]) if k not in set(map(int, shown[i]))]
+
+
+def _onward(engine, cases, recordings, now, then, states, step):
+    """Run states [qpos, qvel, act] (n, ·) on in place, from times now to then (n,); as they are
+    where a simulation fails."""
+    steps = np.rint((then - now) / step).astype(int)
+    on = np.flatnonzero(steps)
+    if not len(on):
+        return
+    qpos, qvel, act = (state[on] for state in states)
+    cases, recordings = [cases[i] for i in on], [recordings[i] for i in on]
+    q, v, _, a = engine.trajectory(
+        cases, recordings, now[on], qpos, qvel, step, int(steps.max()), act=act
+    )
+    for state, run in zip(states, (q, v, a)):
+        run = run[np.arange(len(on)), steps[on]]
+        state[on] = np.where(np.isfinite(run).all(axis=1, keepdims=True), run, state[on])
+
+
+def _recorded(model, recording, row):
+    """qpos (nq,) and qvel (nv,) at a row: velocities as measured, else over the rows around it."""
+    a, b, qvel = max(row - 1, 0), min(row + 1, len(recording.time) - 1), np.full(model.nv, np.nan)
+    if b > a:
+        seconds = recording.time[b] - recording.time[a]
+        mujoco.mj_differentiatePos(model, qvel, seconds, recording.qpos[a], recording.qpos[b])
+    measured = recording.qvel[row]
+    return recording.qpos[row], np.where(np.isfinite(measured), measured, qvel)
+
+
+def _returns(recording, until):
+    """Rows (k,) of a recording, RETURN seconds apart or farther, up to a time."""
+    time = recording.time
+    until = min(until, time[-1])
+    rows = np.unique(np.searchsorted(time, np.arange(time[0], until + 1e-9, RETURN) - 1e-9))
+    return rows[time[rows] <= until + 1e-9]
+
+
+def _together(rows):
+    """[(k,)] as one array (n, K): what is shorter stays at its last."""
+    most = max(map(len, rows))
+    return np.array([np.pad(r, (0, most - len(r)), mode="edge") for r in rows])

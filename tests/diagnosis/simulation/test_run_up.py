@@ -1,0 +1,84 @@
+"""Windows begun in the middle of runs whose springs and bristles no recording shows, against stock
+MuJoCo."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from diagnosis.recordings.recording import Recording
+from diagnosis.simulation.simulator import Window, World
+
+ARM = """
+<mujoco>
+  <option timestep="0.001" integrator="implicitfast"/>
+  <worldbody><body><joint name="elbow" axis="0 1 0" armature="0.02" damping="0.02"
+      stiffness="2"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="0.4"/></body></worldbody>
+  <actuator><motor name="drive" joint="elbow"/></actuator>
+</mujoco>"""
+SAMPLE, AHEAD = 0.02, 15  # seconds between rows, and rows that a window predicts
+VALUES = {"joint_elasticity": (8.0, 0.02), "presliding": (0.3, 6.0), "backlash": (0.1,)}
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "arm.xml"
+    path.write_text(ARM)
+    return World.load(str(path))
+
+
+def run(world, effect, noise=0.0, deflected=0.0):
+    """(setting, Recording of three seconds, velocities (rows, 1)) of the corrected model in stock
+    MuJoCo; what it appends to the coordinates begins at `deflected`."""
+    setting = {world.candidate(effect, "elbow"): VALUES[effect]}
+    model = mujoco.MjModel.from_xml_string(world.corrected_xml(setting)[0])
+    data, rows = mujoco.MjData(model), []
+    time = np.arange(150) * SAMPLE
+    ctrl = 0.8 * np.sin(7 * time) + 0.5 * np.sin(2.3 * time)
+    data.qpos[1:] = deflected
+    for u in ctrl:
+        rows.append((data.qpos[0], data.qvel[0]))
+        data.ctrl[0] = u
+        mujoco.mj_step(model, data, round(SAMPLE / model.opt.timestep))
+    qpos, qvel = np.array(rows).T[:, :, None]
+    noisy = qpos + noise * np.random.default_rng(0).standard_normal(qpos.shape)
+    return setting, Recording("run", time, noisy, np.full_like(qpos, np.nan), ctrl[:, None]), qvel
+
+
+def missed(world, setting, recording, qvel, rows):
+    """RMS by which windows from rows on, begun at their velocities, miss the recording."""
+    windows = [Window(recording, r, r + AHEAD) for r in rows]
+    starts = recording.qpos[list(rows)], qvel[list(rows)]
+    predicted = world.simulate([setting] * len(rows), *starts, windows)[0]
+    measured = np.array([recording.qpos[r : r + AHEAD + 1] for r in rows])
+    return float(np.sqrt(np.mean((predicted - measured) ** 2)))
+
+
+@pytest.mark.parametrize("effect", VALUES)
+def test_what_is_hidden_runs_on_between_returns_to_the_record(world, effect):
+    given = run(world, effect)
+    rows = 40, 77, 120
+    assert missed(world, *given, rows) < 0.05 * missed(world, {}, *given[1:], rows)
+
+
+@pytest.mark.parametrize("noise, most", [(0.0, 0.005), (1e-3, 0.006)])
+def test_a_recording_may_begin_with_a_spring_bent(world, noise, most):
+    given = run(world, "joint_elasticity", noise, deflected=0.3)
+    rows = 60, 80, 110
+    assert missed(world, *given, rows) < most < missed(world, {}, *given[1:], rows) / 4
+
+
+def test_rows_that_were_not_measured_are_no_returns(world):
+    setting, recording, qvel = run(world, "joint_elasticity")
+    recording.qpos[30:50] = np.nan
+    assert missed(world, setting, recording, qvel, (70, 110)) < 1e-3
+
+
+def test_the_same_window_begins_alike_beside_others(world):
+    setting, recording, qvel = run(world, "joint_elasticity", deflected=0.3)
+    rows = [60, 110]
+    windows = [Window(recording, r, r + AHEAD) for r in rows]
+    starts = recording.qpos[rows], qvel[rows]
+    both = world.simulate([setting] * 2, *starts, windows)[0]
+    alone = world.simulate([setting], *(x[:1] for x in starts), windows[:1])[0]
+    np.testing.assert_allclose(both[0], alone[0], atol=1e-12)
