@@ -20,6 +20,7 @@ from diagnosis.selection.unmodelled_force import ABOVE
 
 # of a joint's error that names leave beyond a perfect simulator's, from which they are the nearest
 NEAREST = 0.25
+MOST_LEFT = 0.5  # of a joint's held-out error: names explain the greater part, or are the nearest
 UNNAMED = 2  # units of complexity of a force where nothing has a name
 MOST = 3  # names that an unknown force may have, and variables that it depends on
 
@@ -37,8 +38,10 @@ def _standing_out(world, outcome, joints):
 
 def main_joint(world, outcome, candidate, shares):
     """(joint, share of its error that is left) of the joint in which a finding acts and most force
-    is missing; (None, NaN) where it has no such place. shares: of the channels (share_left())."""
-    joint = _standing_out(world, outcome, sorted(world.joints(candidate.place) or ()))
+    is missing: gravity and air act in all; (None, NaN) where there is none. shares: of the channels
+    (share_left())."""
+    acts = world.joints(candidate.place) or range(world.model.njnt)
+    joint = _standing_out(world, outcome, sorted(acts))
     if joint is None:
         return None, np.nan
     dof = world.model.joint(joint).dofadr[0]
@@ -140,7 +143,8 @@ def _unearned(world, outcome, shares, something):
     curve that was only tried beside it is not even earned."""
     found = outcome.found.fitted.setting
     for candidate in outcome.handed.gone:
-        if isinstance(candidate.effect, Unknown) and candidate not in found:
+        tried = isinstance(candidate.effect, Unknown) and candidate not in found
+        if tried or not world.joints(candidate.place):
             continue
         joint, _ = main_joint(world, outcome, candidate, shares)
         if joint:
@@ -154,7 +158,8 @@ def led(world, outcome, findings, something, channels):
     name: a finer time step is none.
 
     findings: [(candidate or None, finding)], the most important first; channels {channel: errors}:
-    of held-out recordings. Where these show what is missing, they say how much of it is left.
+    of held-out recordings. Where these or those that names were found on show that they leave
+    little, they do, unless these show that they leave most.
     """
     # of two at a joint the more important one: what acts at times may stand beside a curve
     leads = {f["place"]["name"]: f for _, f in reversed(findings) if f["effect"] == "unknown"}
@@ -164,13 +169,13 @@ def led(world, outcome, findings, something, channels):
         joint = finding["place"]["name"] if finding["effect"] == "unknown" else None
         if candidate and joint is None:
             at, share = main_joint(world, outcome, candidate, shares)
-            if f"qpos:{at}" in channels:
-                shown = held_out_share(channels[f"qpos:{at}"])
-                share = shown if np.isfinite(shown) else share
-            told = share if np.isfinite(share) else None
+            errors = channels.get(f"qpos:{at}")
+            shown = held_out_share(errors) if errors else np.nan
+            least = share if np.isnan(shown) else min(share, shown)
+            told = least if np.isfinite(least) else None
             finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
             edge = _at_edge(outcome, candidate)
-            if at and (edge or share > NEAREST):
+            if at and (edge or least > NEAREST or shown > MOST_LEFT):
                 joint = at
                 names.setdefault(joint, []).append(finding)
             elif edge:

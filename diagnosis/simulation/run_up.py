@@ -3,9 +3,9 @@ recorded.
 
 qpos, qvel, act = run_up(engine, cases, windows, begin, measures, step)
 
-Each case runs once through each recording and is brought back to it every RETURN seconds, while
-what is hidden runs on. Where it begins, the returns of the first SETTLE seconds tell: as with any
-observer, what is hidden shows in how far they miss.
+Each case runs once through each stretch of a recording and is brought back to it every RETURN
+seconds, while what is hidden runs on. How that began, the returns of the first SETTLE seconds tell:
+as with any observer, what is hidden shows in how far they miss.
 """
 
 import mujoco
@@ -15,19 +15,17 @@ from diagnosis.common.coordinates import difference
 
 RETURN = 0.1  # seconds between returns to the record
 SETTLE = 1.0  # seconds whose returns tell how what is hidden began
+EARLIER = 2.0  # seconds before a window, from which on what is hidden is followed
 SMALL = 0.1, 1e-6  # step of differences: share of what a hidden state moves, and at least
 
 
 def run_up(engine, cases, windows, begin, measures, step):
     """[qpos, qvel, act] (n, ·) of an Engine's working model at times `begin` (n,) of windows, from
     what was recorded before. measures: as Engine has them."""
-    pairs = {(id(c), id(w.recording)): s for s, (c, w) in enumerate(zip(cases, windows))}
-    order = {key: k for k, key in enumerate(pairs)}
-    own = np.array([order[id(c), id(w.recording)] for c, w in zip(cases, windows)])
-    some = list(pairs.values())
+    own, some = _stretches(cases, windows, begin)
     chosen, recordings = [cases[s] for s in some], [windows[s].recording for s in some]
-    until = [max(begin[own == k].max(), r.time[0] + SETTLE) for k, r in enumerate(recordings)]
-    rows = _together([_returns(r, t) for r, t in zip(recordings, until)])
+    spans = [(begin[own == k].min(), begin[own == k].max()) for k in range(len(some))]
+    rows = _together([_returns(r, *span) for r, span in zip(recordings, spans)])
     follower = _Follower(engine, chosen, recordings, rows, measures[:, some], step)
     k = (follower.time[own] <= begin[:, None] + 1e-9).sum(1) - 1
     states = [x[own, k] for x in follower.path()]
@@ -148,12 +146,28 @@ def _recorded(model, recording, row):
     return recording.qpos[row], np.where(np.isfinite(measured), measured, qvel)
 
 
-def _returns(recording, until):
-    """Rows (k,) of a recording, RETURN seconds apart or farther, up to a time."""
+def _stretches(cases, windows, begin):
+    """(which stretch each window (n,) belongs to, a window of each): windows of a case in a
+    recording that begin no farther apart than EARLIER."""
+    alike = {}
+    for s in np.argsort(begin, kind="stable"):
+        alike.setdefault((id(cases[s]), id(windows[s].recording)), []).append(s)
+    own, some = np.empty(len(begin), int), []
+    for each in alike.values():
+        number = np.cumsum(np.diff(begin[each], prepend=begin[each[0]]) > EARLIER)
+        own[each] = len(some) + number
+        some += [each[int(np.searchsorted(number, k))] for k in range(number[-1] + 1)]
+    return own, some
+
+
+def _returns(recording, first, last):
+    """Rows (k,) of a recording, RETURN seconds apart or farther, from EARLIER before a time up to
+    another, or as long as it takes to settle."""
     time = recording.time
-    until = min(until, time[-1])
-    rows = np.unique(np.searchsorted(time, np.arange(time[0], until + 1e-9, RETURN) - 1e-9))
-    return rows[time[rows] <= until + 1e-9]
+    since = max(first - EARLIER, time[0])
+    until = min(max(last, since + SETTLE), time[-1])
+    marks = np.arange(since, until + 1e-9, RETURN)
+    return np.unique(np.searchsorted(time, marks + 1e-9, side="right") - 1)
 
 
 def _together(rows):

@@ -102,25 +102,33 @@ def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequat
 
 
 @pytest.mark.parametrize(
-    "before, after, floor, effect, share",
+    "fitted, before, after, floor, effect, share",
     [
-        (10.0, 2.0, 3.0, "coulomb_friction", 0.0),  # all is explained
-        (10.0, 6.0, 3.0, "unknown", None),
-        (3.0, 2.9, 3.1, "unknown", None),  # they show nothing
-        (10.0, np.inf, 3.0, "unknown", None),
+        (0.7, 10.0, 2.0, 3.0, "coulomb_friction", 0.0),  # all is explained
+        (0.7, 10.0, 5.0, 3.0, "unknown", None),
+        (0.2, 10.0, 5.0, 3.0, "coulomb_friction", 0.2),
+        (0.2, 10.0, 6.0, 3.0, "unknown", None),  # most is left
+        (0.2, 4.0, 3.9, 3.0, "coulomb_friction", 0.2),  # they show hardly anything
+        (0.7, 4.0, 3.9, 3.0, "unknown", None),
+        (0.7, 10.0, np.inf, 3.0, "unknown", None),
     ],
 )
-def test_held_out_recordings_show_whether_a_name_is_enough(before, after, floor, effect, share):
+def test_held_out_recordings_say_what_a_name_leaves_as_well(
+    fitted, before, after, floor, effect, share
+):
     errors = {"qpos:elbow": {"before": before, "after": after, "floor": floor}}
-    given = outcome(smoothed(1.0), 0.7, DEPENDS)
+    given = outcome(smoothed(1.0), fitted, DEPENDS)
     [only] = led(WORLD, given, [finding(FRICTION)], True, errors)
     assert only["effect"] == effect and only["evidence"].get("error_left") == share
 
 
-def test_a_name_that_predicts_held_out_recordings_badly_is_the_nearest():
-    errors = {"qpos:elbow": {"before": 10.0, "after": 6.0, "floor": 3.0}}
-    [only] = led(WORLD, outcome(smoothed(1.0), 0.1, DEPENDS), [finding(FRICTION)], True, errors)
-    assert only["effect"] == "unknown"
+def test_what_acts_in_all_joints_is_no_better_than_where_most_is_missing():
+    gravity = WORLD.candidate("gravity", "world")
+    given = outcome(smoothed(1.0), 0.7, DEPENDS)
+    given.fitted.setting[gravity] = (0.3, 0.0, -9.8)
+    [only] = led(WORLD, given, [finding(gravity)], True)
+    assert (only["effect"], only["place"]["name"]) == ("unknown", "elbow")
+    assert [o["effect"] for o in only["also_possible"]] == ["gravity"]
 
 
 def test_an_unknown_force_varies_with_what_its_nearest_name_does():

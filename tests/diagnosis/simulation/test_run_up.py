@@ -82,3 +82,14 @@ def test_the_same_window_begins_alike_beside_others(world):
     both = world.simulate([setting] * 2, *starts, windows)[0]
     alone = world.simulate([setting], *(x[:1] for x in starts), windows[:1])[0]
     np.testing.assert_allclose(both[0], alone[0], atol=1e-12)
+
+
+def test_a_gap_in_the_recording_is_run_through(world):
+    setting, recording, qvel = run(world, "joint_elasticity")
+    kept = np.r_[0:30, 140:150]
+    some = Recording(
+        "run", *(x[kept] for x in (recording.time, recording.qpos, recording.qvel, recording.ctrl))
+    )
+    windows, starts = [Window(some, 30, 39)], (some.qpos[30:31], qvel[kept][30:31])
+    predicted = world.simulate([setting], *starts, windows)[0]
+    assert np.isfinite(predicted).all()
