@@ -203,12 +203,13 @@ def _named_there(search, found, fitted, where, log):
     placed, values = where.placed(world, most), best.setting[most]
     beside = judge.fit({**fitted.setting, placed: values}, steps=0)
     log(f"  {placed} {fitted.loss:.3f} -> {beside.loss:.3f}")
-    if beside.loss >= fitted.loss:
+    removed = where.removed(fitted, beside)
+    if beside.loss >= fitted.loss or removed <= 0:
         return None
     low, high = zip(*(b or (v, v) for b, v in zip(intervals(best)[most], values)))
     told = placed, values, where.recording, where.time, where.p_value
     also = tuple((where.placed(world, c), v) for c, v in others.get(most, ()))
-    return Event(*told, low=low, high=high, removed=where.removed(fitted, beside), others=also)
+    return Event(*told, low=low, high=high, removed=removed, others=also)
 
 
 def _curve_there(search, found, fitted, where, log):

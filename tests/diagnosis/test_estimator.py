@@ -212,3 +212,34 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
         assert outcome.left == (motion, rows if where else True)
     else:
         assert outcome.left == "as it was"
+
+
+@pytest.mark.parametrize("loss, removed, told", [(-1.0, 0.3, True), (-1.0, -0.05, False)])
+def test_an_event_removes_error_where_it_is(monkeypatch, loss, removed, told):
+    effect = SimpleNamespace(numerical=False)
+    mass = SimpleNamespace(effect=effect)
+    search = lambda setting, loss: SimpleNamespace(
+        fitted=SimpleNamespace(setting=setting, loss=loss),
+        candidates=[],
+    )
+    there = SimpleNamespace(run=lambda setting: search({mass: (2.0,)}, 0.0), candidates=[])
+    monkeypatch.setattr(estimator, "Identification", lambda *given, log: there)
+    monkeypatch.setattr(estimator, "_classes", lambda s, found, fitted, log, all: (fitted, {}))
+    monkeypatch.setattr(estimator, "without", lambda fitted, c: fitted)
+    monkeypatch.setattr(estimator, "intervals", lambda fitted: {mass: [(1.0, 3.0)]})
+    judge = SimpleNamespace(fit=lambda setting, steps: SimpleNamespace(setting=setting, loss=loss))
+    world = SimpleNamespace(adds_states=lambda c: False)
+    where = SimpleNamespace(
+        parts=lambda train: ["part"],
+        placed=lambda world, c: c,
+        removed=lambda before, after: removed,
+        recording="run",
+        time=(1.0, 2.0),
+        p_value=0.01,
+    )
+    given = SimpleNamespace(world=world, train=[]), SimpleNamespace(judge=judge)
+    fitted = SimpleNamespace(setting={}, loss=0.0)
+    event = estimator._named_there(*given, fitted, where, lambda message: None)
+    assert (event is not None) == told
+    if told:
+        assert event.removed == removed and event.candidate is mass
