@@ -216,8 +216,7 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
 
 @pytest.mark.parametrize("loss, removed, told", [(-1.0, 0.3, True), (-1.0, -0.05, False)])
 def test_an_event_removes_error_where_it_is(monkeypatch, loss, removed, told):
-    effect = SimpleNamespace(numerical=False)
-    mass = SimpleNamespace(effect=effect)
+    mass = type("Mass", (), {"effect": SimpleNamespace(numerical=False)})()
     search = lambda setting, loss: SimpleNamespace(
         fitted=SimpleNamespace(setting=setting, loss=loss),
         candidates=[],
