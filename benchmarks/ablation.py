@@ -29,6 +29,8 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no price of complexity": {"diagnosis.selection.criterion:PRICE": 0.0},
     "start states are certain": {"diagnosis.estimation.ahead:FREE": 0.0},
     "a name stands whatever it leaves": {"diagnosis.unnamed:NEAREST": 2.0},
+    "most of the held-out error may be left": {"diagnosis.unnamed:MOST_LEFT": 99.0},
+    "what is hidden begins at rest": {"diagnosis.simulation.run_up:SETTLE": 0.0},
     "no correction for the number looked at": {"diagnosis.selection.identification:LEVEL": 1.0},
     "a beam of one": {"diagnosis.selection.beam:WIDTH": 1},
     "no values at full size": {"diagnosis.selection.starts:LADDER": ()},
