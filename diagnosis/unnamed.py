@@ -38,10 +38,10 @@ def _standing_out(world, outcome, joints):
 
 def main_joint(world, outcome, candidate, shares):
     """(joint, share of its error that is left) of the joint in which a finding acts and most force
-    is missing: gravity and air act in all; (None, NaN) where there is none. shares: of the channels
-    (share_left())."""
-    acts = world.joints(candidate.place) or range(world.model.njnt)
-    joint = _standing_out(world, outcome, sorted(acts))
+    is missing: gravity and air act in all, a time step in none; (None, NaN) where there is none.
+    shares: of the channels (share_left())."""
+    everywhere = () if candidate.effect.numerical else range(world.model.njnt)
+    joint = _standing_out(world, outcome, sorted(world.joints(candidate.place) or everywhere))
     if joint is None:
         return None, np.nan
     dof = world.model.joint(joint).dofadr[0]

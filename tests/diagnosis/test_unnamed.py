@@ -122,6 +122,14 @@ def test_held_out_recordings_say_what_a_name_leaves_as_well(
     assert only["effect"] == effect and only["evidence"].get("error_left") == share
 
 
+def test_a_finer_step_is_no_name_for_a_force():
+    step = WORLD.candidate("time_step", "world")
+    given = outcome(smoothed(1.0), 0.7, DEPENDS, gains=(0, 0))
+    given.fitted.setting[step] = (1e-4,)
+    [only] = led(WORLD, given, [finding(step)], True)
+    assert only["effect"] == "time_step" and only["evidence"]["error_left"] is None
+
+
 def test_what_acts_in_all_joints_is_no_better_than_where_most_is_missing():
     gravity = WORLD.candidate("gravity", "world")
     given = outcome(smoothed(1.0), 0.7, DEPENDS)
