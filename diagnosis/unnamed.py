@@ -49,12 +49,14 @@ def main_joint(world, outcome, candidate, shares):
 
 
 def held_out_share(errors):
-    """Share of the nominal model's held-out error of a channel that is left, both beyond a perfect
-    simulator's; NaN where it shows hardly more than that. errors: {"before", "after", "floor"}."""
+    """(share of the nominal model's held-out error of a channel that is left, both beyond a perfect
+    simulator's, infinite where it shows nothing; whether it shows clearly more than that). errors:
+    {"before", "after", "floor"}."""
     before, after, floor = (errors[key] for key in ("before", "after", "floor"))
-    if not before > BEYOND * floor or not np.isfinite([before, after]).all():
-        return np.nan
-    return np.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
+    if not np.isfinite([before, after]).all() or before <= floor:
+        return np.inf, False
+    left = np.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
+    return left, before > BEYOND * floor
 
 
 def missing_most(world, outcome, something):
@@ -159,7 +161,7 @@ def led(world, outcome, findings, something, channels):
 
     findings: [(candidate or None, finding)], the most important first; channels {channel: errors}:
     of held-out recordings. Where these or those that names were found on show that they leave
-    little, they do, unless these show that they leave most.
+    little, they do, unless these show clearly that they leave most.
     """
     # of two at a joint the more important one: what acts at times may stand beside a curve
     leads = {f["place"]["name"]: f for _, f in reversed(findings) if f["effect"] == "unknown"}
@@ -170,12 +172,12 @@ def led(world, outcome, findings, something, channels):
         if candidate and joint is None:
             at, share = main_joint(world, outcome, candidate, shares)
             errors = channels.get(f"qpos:{at}")
-            shown = held_out_share(errors) if errors else np.nan
-            least = share if np.isnan(shown) else min(share, shown)
+            shown, clearly = held_out_share(errors) if errors else (np.inf, False)
+            least = min(share, shown)
             told = least if np.isfinite(least) else None
             finding = {**finding, "evidence": {**finding["evidence"], "error_left": told}}
             edge = _at_edge(outcome, candidate)
-            if at and (edge or least > NEAREST or shown > MOST_LEFT):
+            if at and (edge or least > NEAREST or (clearly and shown > MOST_LEFT)):
                 joint = at
                 names.setdefault(joint, []).append(finding)
             elif edge:

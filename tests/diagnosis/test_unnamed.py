@@ -108,8 +108,9 @@ def test_a_name_stands_by_how_much_of_the_error_it_leaves(after, effect, adequat
         (0.7, 10.0, 5.0, 3.0, "unknown", None),
         (0.2, 10.0, 5.0, 3.0, "coulomb_friction", 0.2),
         (0.2, 10.0, 6.0, 3.0, "unknown", None),  # most is left
-        (0.2, 4.0, 3.9, 3.0, "coulomb_friction", 0.2),  # they show hardly anything
-        (0.7, 4.0, 3.9, 3.0, "unknown", None),
+        (0.2, 4.0, 3.9, 3.0, "coulomb_friction", 0.2),  # they show little
+        (0.7, 4.0, 2.9, 3.0, "coulomb_friction", 0.0),
+        (0.7, 3.0, 2.9, 3.1, "unknown", None),  # or nothing
         (0.7, 10.0, np.inf, 3.0, "unknown", None),
     ],
 )
