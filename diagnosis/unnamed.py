@@ -139,16 +139,15 @@ def _at_edge(outcome, candidate):
     return at_limit(candidate, values, plausible(candidate, outcome.found.usual))
 
 
-def _unearned(world, outcome, shares, something):
+def _unearned(world, outcome, something):
     """(joint or None, variables) where a force is missing that no finding tells of: that of what
     the search found and kept-back recordings spoke against, or the one that stands out most. A
     curve that was only tried beside it is not even earned."""
     found = outcome.found.fitted.setting
     for candidate in outcome.handed.gone:
-        tried = isinstance(candidate.effect, Unknown) and candidate not in found
-        if tried or not world.joints(candidate.place):
+        if isinstance(candidate.effect, Unknown) and candidate not in found:
             continue
-        joint, _ = main_joint(world, outcome, candidate, shares)
+        joint = _standing_out(world, outcome, sorted(world.joints(candidate.place) or ()))
         if joint:
             return joint, depends_on(world.model, candidate)
     return missing_most(world, outcome, something), ()
@@ -187,7 +186,7 @@ def led(world, outcome, findings, something, channels):
         elif joint not in order:
             order.append(joint)
     physics = [f for f in order if isinstance(f, str) or not is_numerical(f["effect"])]
-    joint, on = (None, ()) if physics else _unearned(world, outcome, shares, something)
+    joint, on = (None, ()) if physics else _unearned(world, outcome, something)
     order += [joint] if joint else []
     told = lambda joint: leads.get(joint) or unknown(joint, outcome, on)
     force = lambda joint: beside(told(joint), names.get(joint, []))

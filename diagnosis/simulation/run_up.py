@@ -41,9 +41,11 @@ class _Follower:
         self.engine, self.cases, self.recordings, self.step = engine, cases, recordings, step
         self.time = np.array([r.time[row] for r, row in zip(recordings, rows)])
         self.settled = max(int((self.time - self.time[:, :1] <= SETTLE).sum(1).max()) - 1, 0)
-        shown = [[_recorded(engine.nominal, r, i) for i in row] for r, row in zip(recordings, rows)]
-        shown = [engine.true(*map(np.array, zip(*each)), measures) for each in zip(*shown)]
-        self.qpos, self.qvel = (np.array(x) for x in zip(*shown))  # (K, n, ·)
+        first = [_recorded(engine.nominal, r, row[0]) for r, row in zip(recordings, rows)]
+        self.first = engine.true(*map(np.array, zip(*first)), measures)  # (n, nq), (n, nv)
+        shown = np.array([r.qpos[row] for r, row in zip(recordings, rows)])
+        still = np.zeros((len(shown), engine.nominal.nv))
+        self.qpos = [engine.true(q, still, measures)[0] for q in np.swapaxes(shown, 0, 1)]
 
     def path(self):
         """[qpos, qvel, act] (n, K, ·) of the working model at the rows."""
@@ -54,7 +56,7 @@ class _Follower:
 
     def _begun(self, last):
         """The path up to a return, with what is hidden begun where the returns are missed least."""
-        n, own = len(self.cases), hidden(self.engine)
+        n, own = len(self.cases), _hidden(self.engine)
         path, missed = self._followed(self._at_rest(), 0, last)
         size = [SMALL[0] * np.sqrt(np.mean(path[i][..., k] ** 2, 1)) + SMALL[1] for i, k in own]
         begun = [np.tile(x[:, 0], (len(own), 1)) for x in path]
@@ -78,7 +80,7 @@ class _Follower:
         """States at the first rows: what is hidden is at rest in the middle."""
         n, model = len(self.cases), self.engine.model
         qpos, qvel = np.tile(model.qpos0, (n, 1)), np.zeros((n, model.nv))
-        self._return(qpos, qvel, self.qpos[0], self.qvel[0])
+        self._return(qpos, qvel, *self.first)
         return [qpos, qvel, np.zeros((n, model.na))]
 
     def _followed(self, states, first, last):
@@ -111,12 +113,12 @@ class _Follower:
         qvel[np.ix_(known, self.engine.v)] = shown_qvel[known]
 
 
-def hidden(engine):
+def _hidden(engine):
     """[(0, 1 or 2: qpos, qvel or act; index)] of an Engine's states that a recording does not
     show."""
     shown = engine.q, engine.v, np.flatnonzero(~engine.hidden)
     sizes = engine.model.nq, engine.model.nv, engine.model.na
-    return [(i, k) for i in range(3) for k in range(sizes[i]) if k not in set(map(int, shown[i]))]
+    return [(i, k) for i in range(3) for k in np.setdiff1d(np.arange(sizes[i]), shown[i])]
 
 
 def _onward(engine, cases, recordings, now, then, states, step):

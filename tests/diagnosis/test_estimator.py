@@ -214,7 +214,9 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
         assert outcome.left == "as it was"
 
 
-@pytest.mark.parametrize("loss, removed, told", [(-1.0, 0.3, True), (-1.0, -0.05, False)])
+@pytest.mark.parametrize(
+    "loss, removed, told", [(-1.0, 0.3, True), (-1.0, -0.05, False), (0.5, 0.3, False)]
+)
 def test_an_event_removes_error_where_it_is(monkeypatch, loss, removed, told):
     mass = type("Mass", (), {"effect": SimpleNamespace(numerical=False)})()
     search = lambda setting, loss: SimpleNamespace(
