@@ -178,15 +178,15 @@ def place_of(candidate):
 
 def parameters_of(candidate, values, bounds=None):
     """[parameter] of a finding; the interval of a value that the recordings do not show is None,
-    and so is the value where it stays as it was."""
+    and so is the value where it stays as it was, or where there was none."""
     out = []
     for i, (p, v) in enumerate(zip(candidate.parameters, values)):
         untold = bounds is not None and bounds[i] is None
-        unseen = untold and bool(np.isclose(v, p.nominal, rtol=1e-9, atol=0))
+        kept = np.isinf(p.nominal) or np.isclose(v, p.nominal, rtol=1e-9, atol=0)
         entry = {
             "name": p.name,
             "nominal": float(p.nominal),
-            "value": None if unseen else float(np.clip(v, p.low, p.high)),
+            "value": None if untold and kept else float(np.clip(v, p.low, p.high)),
             "unit": p.unit,
         }
         if candidate.effect.name == "unknown":

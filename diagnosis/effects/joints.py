@@ -355,14 +355,15 @@ class JointStop(JointEffect):
 
     name, simplicity = "joint_stop", 2
     acts_through = "position"
-    NEVER = 1e6  # a bound that is never met
+    NEVER = 1e5  # a bound that far away is never met
+    NONE = 1e6  # where a side without a stop is begun
 
     def parameters(self, model, i):
         low, high = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
         unit = self.unit(model, i, "rad", "m")
         return (
-            Parameter("low", unit, low, -self.NEVER, self.NEVER, 0.01),
-            Parameter("high", unit, high, -self.NEVER, self.NEVER, -0.01),
+            Parameter("low", unit, low, -2 * self.NONE, 2 * self.NONE, 0.01),
+            Parameter("high", unit, high, -2 * self.NONE, 2 * self.NONE, -0.01),
         )
 
     def probes(self, model, i, recordings):
@@ -370,9 +371,8 @@ class JointStop(JointEffect):
         low, high = (p.nominal for p in self.parameters(model, i))
         a, b, c, d = np.quantile(position, [0.03, 0.15, 0.85, 0.97])
         both = [(x, y) for x, y in ((a, d), (b, c)) if x > low and y < high]
-        return np.array(
-            [(x, high) for x in (a, b) if x > low] + [(low, x) for x in (c, d) if x < high] + both
-        ).reshape(-1, 2)
+        starts = [(x, high) for x in (a, b) if x > low] + [(low, x) for x in (c, d) if x < high]
+        return np.clip(np.array(starts + both).reshape(-1, 2), -self.NONE, self.NONE)
 
     def edit(self, model, i, values):
         model.jnt_limited[i] = True

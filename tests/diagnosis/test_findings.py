@@ -15,7 +15,10 @@ def test_findings_tell_where_a_curve_has_its_knots_and_keep_numbers():
         unmodelled.curve(arm(), "elbow", "time", (0.0, 2.0, 3.0)),
     )
     assert [p["at"] for p in findings.parameters_of(curve, (1.0, 2.0, 3.0))] == [0.0, 2.0, 3.0]
-    assert [p["value"] for p in findings.parameters_of(stop, (-np.inf, 0.5))] == [-1e6, 0.5]
+    told = lambda *bounds: [
+        p["value"] for p in findings.parameters_of(stop, (-np.inf, 0.5), *bounds)
+    ]
+    assert told() == [-2e6, 0.5] and told([None, (0.4, 0.6)]) == [None, 0.5]
     inf = np.inf
     assert [
         findings.removed(*errors)

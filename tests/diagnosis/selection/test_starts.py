@@ -1,11 +1,14 @@
 """Where effects are begun: how large steps are, and which waves the located force chooses."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
 from plants import DRIVEN_PENDULUM, recorded
 
 from diagnosis.effects.friction import TURNS
+from diagnosis.effects.joints import JointStop
 from diagnosis.estimation.smoother import Trajectory
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.selection.starts import STEP, Starts
@@ -39,6 +42,20 @@ def test_a_stop_on_one_side_has_a_step_for_that_side_alone(machine):
     with np.errstate(all="raise"):
         [start] = Starts(world, {stop: (-0.5, np.inf)}, usual).of([stop])
     assert (start.directions != 0).tolist() == [[True, False]]
+
+
+def test_a_stop_is_begun_on_either_side_alone(machine):
+    world, usual = machine
+    stop = world.candidate("joint_stop", "pivot")
+    starts = Starts(world, {}, usual).of([stop])
+    met = [abs(s.base + row) < JointStop.NEVER for s in starts for row in s.directions]
+    assert {(True, False), (False, True), (True, True)} == {tuple(row) for row in met}
+    position = usual.recordings[0].qpos[:, 0]
+    model, motion = world.model, copy.deepcopy(world.model)
+    low, high = next(v for s in starts for v in [s.base + s.directions[0]] if v[1] > 1e5)
+    stop.effect.edit(motion, 0, (low, high))
+    assert motion.jnt_limited[0] and position.min() < motion.jnt_range[0, 0] < position.max()
+    assert motion.jnt_range[0, 1] == JointStop.NEVER and not model.jnt_limited[0]
 
 
 @pytest.mark.parametrize("effect, begun", [("mass", 3), ("center_of_mass", 7), ("gain", 3)])
