@@ -100,7 +100,8 @@ def _outcome(search, found, event, say, log):
         if lasting is None:
             outcome.event = _sometimes(search, found, outcome.fitted, where, there, log)
             break
-        found = replace(found, fitted=lasting)
+        motion = copy(found.smoother).locate(lasting.setting, found.trajectory, passes=1)
+        found = replace(found, fitted=lasting, trajectory=motion)
         outcome = _told(search, found, say, log)
     return outcome
 

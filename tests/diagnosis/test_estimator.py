@@ -267,17 +267,22 @@ def test_what_is_found_everywhere_is_told_in_the_place_of_an_event(monkeypatch):
     """And what is left is looked at once more, with it."""
     told, asked = [], []
     search = SimpleNamespace(world=None, train=[])
-    found = estimator.Found("friction", *[None] * 8)
-    monkeypatch.setattr(
-        estimator,
-        "_told",
-        lambda s, found, *o: told.append(found.fitted) or Set(fitted=found.fitted, event=None),
-    )
-    monkeypatch.setattr(estimator, "concentrated", lambda fitted: f"where {fitted} errs")
+    locate = lambda setting, near, passes: f"{near} under {setting}"
+    smoother = SimpleNamespace(locate=locate)
+    found = estimator.Found(Set(setting="friction"), "motion", None, smoother, *[None] * 5)
+
+    def tell(search, found, say, log):
+        told.append(found.trajectory)
+        return Set(fitted=found.fitted, event=None)
+
+    errs = lambda fitted: f"where {fitted.setting} errs"
+    monkeypatch.setattr(estimator, "_told", tell)
+    monkeypatch.setattr(estimator, "concentrated", errs)
     monkeypatch.setattr(estimator, "_searched", lambda s, fitted, where, log: asked.append(where))
-    lasting = iter(["map", None])
+    lasting = iter([Set(setting="map"), None])
     monkeypatch.setattr(estimator, "_lasting", lambda *given: next(lasting))
     monkeypatch.setattr(estimator, "_sometimes", lambda s, found, fitted, where, *o: where)
     outcome = estimator._outcome(search, found, None, None, None)
-    assert told == ["friction", "map"] and asked == ["where friction errs", "where map errs"]
-    assert outcome.fitted == "map" and outcome.event == "where map errs"
+    assert told == ["motion", "motion under map"]
+    assert asked == ["where friction errs", "where map errs"]
+    assert outcome.fitted.setting == "map" and outcome.event == "where map errs"
