@@ -5,10 +5,11 @@
     system.advance(ctrl, 0.01)
     qpos, qvel = system.reading()                      # as ideal sensors read
 
-MuJoCo supplies mass matrix, Coriolis forces, gravity, joint ranges and contacts of a model without
-springs, dampers, friction or drives; those are this module's and the laws' own equations. The
-motion is integrated here, by Adams and Bashforth's two-step formula. Dry friction is solved as a
-complementarity problem (Moreau's time stepping), without MuJoCo's soft constraint.
+MuJoCo supplies mass matrix (with rotors that two joints drive), Coriolis forces, gravity, joint
+ranges and contacts of a model without springs, dampers, friction or drives; those are this module's
+and the laws' own equations. The motion is integrated here, by Adams and Bashforth's two-step
+formula. Dry friction is solved as a complementarity problem (Moreau's time stepping), without
+MuJoCo's soft constraint.
 """
 
 from dataclasses import replace
@@ -43,7 +44,10 @@ class TrueSystem:
         self.transmission = next((k for k in self.laws if isinstance(k, Transmission)), None)
         if self.transmission is not None:  # the rotor is simulated beside the tree
             bare = bare.with_link(self.transmission.link, armature=0.0)
-        self.model = mujoco.MjModel.from_xml_string(to_mjcf(bare))
+        joints = [k.joint_name for k in robot.links]
+        tendons = "".join(k.couple(joints) for k in self.laws if _has(k, "couple"))
+        text = to_mjcf(bare).replace("</mujoco>", tendons + "</mujoco>")
+        self.model = mujoco.MjModel.from_xml_string(text)
         self.data = mujoco.MjData(self.model)
         self._index(robot)
 
@@ -79,7 +83,7 @@ class TrueSystem:
         hooked = lambda name: [k for k in self.laws if _has(k, name)]
         self.hooks = {
             name: hooked(name)
-            for name in ("control", "drive", "force", "friction", "bodies", "couple", "measure")
+            for name in ("control", "drive", "force", "friction", "bodies", "measure")
         }
         if self._air is not None and robot.density > 0:  # of the nominal model, without a wind
             self.hooks["bodies"].append(self._air)
@@ -126,8 +130,6 @@ class TrueSystem:
         smooth = data.qacc_smooth.copy()
         self._smooth_before = smooth
         rate = smooth if before is None else 1.5 * smooth - 0.5 * before
-        if self.hooks["couple"]:
-            rate = self._couple(rate)
         if self._rubs:
             rate = self._rub(rate)
         self.steps += 1
@@ -190,15 +192,6 @@ class TrueSystem:
         out = np.empty_like(unit)
         mujoco.mj_solveM(self.model, self.data, out, unit)
         return out
-
-    def _couple(self, rate):
-        """Accelerations (nv,) with the forces of coupled inertias."""
-        for law in self.hooks["couple"]:
-            dofs = np.array([self.dof[law.link], self.dof[law.other]])
-            columns = self._mobility(dofs)
-            push = law.couple(rate[dofs].sum(), columns[:, dofs].sum())
-            rate = rate + push * columns.sum(0)
-        return rate
 
     def _rub(self, rate):
         """Accelerations (nv,) with dry friction, contacts and stops pushing as they did last."""

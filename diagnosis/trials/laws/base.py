@@ -37,8 +37,8 @@ class Law:
     def bodies(self, s):
         """Add to s.data.xfrc_applied."""
 
-    def couple(self, acceleration, mobility):
-        """Force on both joints, from the sum of accelerations without it and of M⁻¹'s block."""
+    def couple(self, joints):
+        """MJCF of a tendon that couples joints, of which these are the names, by link."""
 
     def measure(self, s, q, v):
         """Change what ideal sensors of these faults read, (links,) each, in place."""

@@ -85,15 +85,14 @@ class CoupledFriction(Law):
 
 
 class CoupledInertia(Law):
-    """A rotor J driven by both joints: kinetic energy J (v_a + v_b)²/2.
-
-    Its force −J c (cᵀa) is solved together with the motion, by the matrix inversion lemma.
-    """
+    """A rotor J driven by both joints: kinetic energy J (v_a + v_b)²/2, in the mass matrix, so that it
+    resists dry friction and contacts as well."""
 
     effect = "coupled_inertia"
 
-    def couple(self, acceleration, mobility):
-        return -self.inertia * acceleration / (1 + self.inertia * mobility)
+    def couple(self, joints):
+        both = "".join(f'<joint joint="{joints[i]}" coef="1"/>' for i in (self.other, self.link))
+        return f'<tendon><fixed armature="{self.inertia:.12g}">{both}</fixed></tendon>'
 
 
 class CubicSpring(Law):

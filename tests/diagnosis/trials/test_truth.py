@@ -152,19 +152,22 @@ def test_friction_of_coupled_joints_solves_the_complementarity_problem():
             assert abs(slip) < 1e-4 or f == pytest.approx(-most * np.sign(slip))
 
 
-def test_coupled_inertia_is_mujocos_tendon_armature():
+@pytest.mark.parametrize("friction, stops", [(0.0, None), (0.3, None), (0.0, (0.1, 0.45))])
+def test_coupled_inertia_is_mujocos_tendon_armature(friction, stops):
+    """To dry friction and to stops as to every other force."""
     robot = draw_robot(
         np.random.default_rng(8), replace(DEVELOPMENT, joints=(2, 2), passive=0, slides=0)
     )
-    robot = replace(
-        robot, links=tuple(replace(k, frictionloss=0.0, range=None) for k in robot.links)
-    )
+    links = [replace(k, frictionloss=friction, range=None) for k in robot.links]
+    robot = replace(robot, links=(links[0], replace(links[1], range=stops)))
     tendon = (
         '<tendon><fixed armature="0.05"><joint joint="joint0" coef="1"/>'
         '<joint joint="joint1" coef="1"/></fixed></tendon></mujoco>'
     )
     text = to_mjcf(replace(robot, step=1e-4, integrator="RK4")).replace("</mujoco>", tendon)
-    compare(robot, [L.CoupledInertia(1, other=0, inertia=0.05)], text, 2e-4)
+    smooth = not friction and not stops
+    law = L.CoupledInertia(1, other=0, inertia=0.05)
+    compare(robot, [law], text, 2e-4 if smooth else 1e-3)
 
 
 def compare(robot, laws, text, tolerance, start=None):
