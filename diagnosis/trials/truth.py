@@ -94,6 +94,8 @@ class TrueSystem:
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:], self.data.qvel[:] = qpos, qvel
         self.time, self.steps, self.touched = 0.0, 0, 0
+        if self.transmission is not None:
+            self.transmission.state = None  # the rotor begins where the link does
         self._look()
         for law in self.laws:
             law.reset(self)

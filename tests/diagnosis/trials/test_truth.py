@@ -104,6 +104,35 @@ def test_laws_against_an_equation_solved_by_scipy(law, force):
     assert np.abs(got - wanted).max() < 3e-3 * acts + 2e-5
 
 
+AGAIN = [
+    *(law for law, _ in LAWS),
+    L.JointElasticity(0, stiffness=60.0, damping=0.2),
+    L.Backlash(0, gap=0.1, stiffness=2000.0, damping=1.0),
+    L.Presliding(0, frictionloss=0.2, stiffness=20.0),
+    L.Hysteresis(0, stiffness=3.0, reach=0.1),
+    L.WarmingGrease(0, damping=0.3, heat=0.1),
+    L.Delay(0, actuator=0, seconds=0.03),
+    L.RateLimit(0, actuator=0, rate=20.0),
+]
+
+
+@pytest.mark.parametrize("law", AGAIN, ids=lambda law: type(law).__name__)
+def test_a_recording_does_not_remember_the_one_before(law):
+    def recorded(system, start):
+        system.reset(np.array([start]), np.zeros(1))
+        out = []
+        for k in range(30):
+            system.advance(np.array([1.5 * np.cos(0.07 * k)]), 0.01)
+            out.append(system.reading())
+        return np.array(out)
+
+    system = TrueSystem(pendulum(), [law])
+    recorded(system, 1.5)
+    second = recorded(system, -0.4)
+    first = recorded(TrueSystem(pendulum(), [law]), -0.4)
+    assert np.abs(first - second).max() == 0.0
+
+
 def test_elastic_joint_against_two_masses_solved_by_scipy():
     stiffness, damping = 60.0, 0.2
     law = L.JointElasticity(0, stiffness=stiffness, damping=damping)
