@@ -79,35 +79,6 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         event = None
     if event:
         search, found, event = _undisturbed(search, found, event)
-    outcome = _outcome(search, found, event, say, log)
-    outcome.earned = bool(outcome.fitted.setting or outcome.event)
-    say(0.85, "checking what is handed over")
-    _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
-    if not physics(outcome.fitted.setting):
-        _nameless(search, outcome)
-    say(0.95, "held-out error")
-    return findings.assemble(world, train, held_out, outcome)
-
-
-def _outcome(search, found, event, say, log):
-    """The Outcome so far. What a search finds where most is left takes the place of what was
-    found where it is better on all windows; otherwise it is an event there."""
-    outcome = _told(search, found, say, log)
-    outcome.event = event
-    while not outcome.event and (where := concentrated(outcome.fitted)):
-        there = _searched(search, outcome.fitted, where, log)
-        lasting = _lasting(search, found.judge, outcome.fitted, there, log)
-        if lasting is None:
-            outcome.event = _sometimes(search, found, outcome.fitted, where, there, log)
-            break
-        motion = copy(found.smoother).locate(lasting.setting, found.trajectory, passes=1)
-        found = replace(found, fitted=lasting, trajectory=motion)
-        outcome = _told(search, found, say, log)
-    return outcome
-
-
-def _told(search, found, say, log):
-    """The Outcome so far: the classes of what was found, and whether anything is left."""
     say(0.75, "what could stand in a finding's place")
     fitted, others = _classes(search, found, found.fitted, log, search.candidates)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
@@ -115,7 +86,15 @@ def _told(search, found, say, log):
     fitted = changing(found.judge, fitted)
     others = rivals.together(others, fitted, found.sets)
     say(0.8, "testing for anything left")
-    return _checked(search, found, fitted, others, log)
+    outcome = _checked(search, found, fitted, others, log)
+    outcome.event = event or _sometimes(search, found, outcome.fitted, log)
+    outcome.earned = bool(outcome.fitted.setting or outcome.event)
+    say(0.85, "checking what is handed over")
+    _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
+    if not physics(outcome.fitted.setting):
+        _nameless(search, outcome)
+    say(0.95, "held-out error")
+    return findings.assemble(world, train, held_out, outcome)
 
 
 def _undisturbed(search, found, event):
@@ -195,39 +174,26 @@ def _instead(search, found, fitted, names, joint):
     return alone if better else None
 
 
-def _searched(search, fitted, where, log):
-    """(Fitted, others): the set that a search finds beside a Fitted set where a Condition holds,
-    and its classes; the set itself where that is too short to search in."""
-    parts = where.parts(search.train)
-    if not parts:
-        return fitted, {}
-    there = Identification(search.world, parts, log=log)
-    inside = there.run(fitted.setting)
-    return _classes(there, inside, inside.fitted, log, there.candidates)
-
-
-def _lasting(search, judge, fitted, there, log):
-    """What a search found where a Condition holds, fitted to all windows, where it is earned over a
-    Fitted set there too; or None."""
-    best, _ = there
-    if best.setting.keys() == fitted.setting.keys():
+def _sometimes(search, found, fitted, log):
+    """The Event of what is missing beside a Fitted set under a condition only, or None: the effect
+    that a search finds where it holds, or the curve that the located force follows there."""
+    where = concentrated(fitted)
+    if not where:
         return None
-    lasting = judge.fit(best.setting, near=fitted)
-    log(f"  at all times: {fitted.loss:.3f} -> {lasting.loss:.3f} {said(lasting.setting)}")
-    return lasting if lasting.settled and search.earned(fitted, lasting) else None
-
-
-def _sometimes(search, found, fitted, where, there, log):
-    """The Event of what is missing beside a Fitted set where a Condition holds only, or None: the
-    effect that a search finds there, or the curve that the located force follows."""
-    return _named_there(search, found, fitted, where, there, log) or _curve_there(
+    return _named_there(search, found, fitted, where, log) or _curve_there(
         search, found, fitted, where, log
     )
 
 
-def _named_there(search, found, fitted, where, there, log):
-    """The Event of the effect that a search found beside a Fitted set where a Condition holds."""
-    world, judge, (best, others) = search.world, found.judge, there
+def _named_there(search, found, fitted, where, log):
+    """The Event of the effect that a search finds beside a Fitted set where a Condition holds."""
+    world, judge = search.world, found.judge
+    parts = where.parts(search.train)
+    if not parts:
+        return None
+    there = Identification(world, parts, log=log)
+    inside = there.run(fitted.setting)
+    best, others = _classes(there, inside, inside.fitted, log, there.candidates)
     # what has states of its own cannot come and go
     steady = lambda c: c in fitted.setting or c.effect.numerical or world.adds_states(c)
     new = [c for c in best.setting if not steady(c)]

@@ -217,19 +217,6 @@ class Identification:
         p = paired(now.score, fitted.score).p_value
         losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
         self.log(f"  {losses} {'' if fitted.settled else '(limit) '}{said(fitted.setting)}")
-        return self._in_its_place(judge, fitted, now)
-
-    def _in_its_place(self, judge, fitted, now):
-        """A Fitted set without what it makes needless, where it predicts better than what there was
-        by no chance and is not worth its price beside that."""
-        added = lambda: physics(fitted.setting.keys() - now.setting.keys())
-        better = lambda: self.no_chance(paired(now.score, fitted.score), len(added()))
-        while fitted.loss >= now.loss - TIED and better():
-            less = min(self._less(judge, fitted), key=lambda f: f.loss, default=fitted)
-            if less.loss >= fitted.loss:
-                break
-            self.log(f"   in its place: {less.loss:.3f} {said(less.setting)}")
-            fitted = less
         return fitted
 
     def _beside(self, judge, judged, now, best):
@@ -333,8 +320,12 @@ class Identification:
         is earned over what there was: together effects may be earned of which none is. Those that
         small changes show to be needed are not tried without."""
         whole = fitted
-        while True:
-            tries = [f for f in self._less(judge, fitted) if self.earned(now, f)]
+        while len(fitted.setting) > 1:
+            rest = lambda out: {c: v for c, v in fitted.setting.items() if c is not out}
+            tries = [
+                judge.fit(rest(out), steps=3, near=fitted) for out in self._missed_least(fitted)
+            ]
+            tries = [f for f in tries if self.earned(now, f)]
             less = min(tries, key=lambda f: f.loss, default=None)
             if less:
                 step = paired(less.score, fitted.score)
@@ -343,12 +334,6 @@ class Identification:
                 break
             fitted = judge.fit(less.setting, near=less)
         return fitted if fitted is whole else judge.fit(fitted.setting)
-
-    def _less(self, judge, fitted):
-        """[Fitted] of a set without one of its effects, those that are missed least."""
-        outs = self._missed_least(fitted) if len(fitted.setting) > 1 else []
-        rests = [{c: v for c, v in fitted.setting.items() if c is not out} for out in outs]
-        return [judge.fit(rest, steps=3, near=fitted) for rest in rests]
 
     def _missed_least(self, fitted):
         """Up to TRIED effects of a set that may not earn their place."""

@@ -12,10 +12,12 @@ import mujoco
 import numpy as np
 
 from diagnosis.common.coordinates import difference
+from diagnosis.common.distributions import f_sf
 
 RETURN = 0.1  # seconds between returns to the record
 SETTLE = 1.0  # seconds whose returns tell how what is hidden began
 EARLIER = 2.0  # seconds before a window, from which on what is hidden is followed
+LEVEL = 0.01  # of chance, below which it is taken to have begun elsewhere than at rest
 SMALL = 0.1, 1e-6  # step of differences: share of what a hidden state moves, and at least
 
 
@@ -55,26 +57,28 @@ class _Follower:
         return [np.concatenate([a, b[:, 1:]], 1) for a, b in zip(begun, rest)]
 
     def _begun(self, last):
-        """The path up to a return, with what is hidden begun where the returns are missed least."""
-        n, own = len(self.cases), _hidden(self.engine)
-        path, missed = self._followed(self._at_rest(), 0, last)
+        """The path up to a return, with what is hidden begun at rest, or where the returns are
+        missed so much less that it is no chance. The first one tells how far the velocity was."""
+        n, own, rest = len(self.cases), _hidden(self.engine), self._at_rest()
+        path, missed = self._followed(rest, 0, last)
         size = [SMALL[0] * np.sqrt(np.mean(path[i][..., k] ** 2, 1)) + SMALL[1] for i, k in own]
-        begun = [np.tile(x[:, 0], (len(own), 1)) for x in path]
+        begun = [np.tile(x, (len(own), 1)) for x in rest]
         for j, (i, k) in enumerate(own):
             begun[i][j * n : (j + 1) * n, k] += size[j]
-        moved, other = self._followed(begun, 0, last)
-        scale = np.sqrt(np.mean(missed**2, 1, keepdims=True)) + 1e-12
-        slopes = np.moveaxis((other.reshape(len(own), *missed.shape) - missed) / scale, 0, -1)
-        slopes, missed = slopes.reshape(n, -1, len(own)), (missed / scale).reshape(n, -1, 1)
+        other = self._followed(begun, 0, last)[1].reshape(len(own), *missed.shape)
+        scale = np.sqrt(np.mean(missed[:, 2:] ** 2, 1, keepdims=True)) + 1e-12
+        off = lambda missed: (missed[..., 2:, :] / scale).reshape(*missed.shape[:-2], -1)
+        slopes, off_rest = np.moveaxis(off(other - missed), 0, -1), off(missed)
         gram = np.swapaxes(slopes, 1, 2) @ slopes
         ridge = 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-12
-        amounts = np.swapaxes(slopes, 1, 2) @ missed
+        amounts = np.swapaxes(slopes, 1, 2) @ off_rest[..., None]
         amounts = -np.linalg.solve(gram + ridge * np.eye(len(own)), amounts)[..., 0]
-        changes = (x.reshape(len(own), *whole.shape) - whole for x, whole in zip(moved, path))
-        return [
-            whole + np.einsum("nh,hnks->nks", amounts, change)
-            for whole, change in zip(path, changes)
-        ]
+        begun = [x.copy() for x in rest]
+        for j, (i, k) in enumerate(own):
+            begun[i][:, k] += amounts[:, j] * size[j]
+        moved, missed = self._followed(begun, 0, last)
+        nearer = _no_chance(off_rest, off(missed), len(own))
+        return [np.where(nearer[:, None, None], a, b) for a, b in zip(moved, path)]
 
     def _at_rest(self):
         """States at the first rows: what is hidden is at rest in the middle."""
@@ -111,6 +115,15 @@ class _Follower:
         known = np.isfinite(shown_qpos).all(1) & np.isfinite(shown_qvel).all(1)
         qpos[np.ix_(known, self.engine.q)] = shown_qpos[known]
         qvel[np.ix_(known, self.engine.v)] = shown_qvel[known]
+
+
+def _no_chance(before, after, number):
+    """Whether misses (n, k) fall by more than chance makes them with so many values fitted: an
+    F-test."""
+    left = np.maximum((before != 0).sum(1) - number, 1)
+    removed = (before**2).sum(1) - (after**2).sum(1)
+    ratio = np.nan_to_num(removed / number * left / np.maximum((after**2).sum(1), 1e-300))
+    return np.array([f_sf(max(r, 0.0), number, n) < LEVEL for r, n in zip(ratio, left)])
 
 
 def _hidden(engine):

@@ -219,11 +219,19 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
 )
 def test_an_event_removes_error_where_it_is(monkeypatch, loss, removed, told):
     mass = type("Mass", (), {"effect": SimpleNamespace(numerical=False)})()
+    search = lambda setting, loss: SimpleNamespace(
+        fitted=SimpleNamespace(setting=setting, loss=loss),
+        candidates=[],
+    )
+    there = SimpleNamespace(run=lambda setting: search({mass: (2.0,)}, 0.0), candidates=[])
+    monkeypatch.setattr(estimator, "Identification", lambda *given, log: there)
+    monkeypatch.setattr(estimator, "_classes", lambda s, found, fitted, log, all: (fitted, {}))
     monkeypatch.setattr(estimator, "without", lambda fitted, c: fitted)
     monkeypatch.setattr(estimator, "intervals", lambda fitted: {mass: [(1.0, 3.0)]})
     judge = SimpleNamespace(fit=lambda setting, steps: SimpleNamespace(setting=setting, loss=loss))
     world = SimpleNamespace(adds_states=lambda c: False)
     where = SimpleNamespace(
+        parts=lambda train: ["part"],
         placed=lambda world, c: c,
         removed=lambda before, after: removed,
         recording="run",
@@ -232,57 +240,7 @@ def test_an_event_removes_error_where_it_is(monkeypatch, loss, removed, told):
     )
     given = SimpleNamespace(world=world, train=[]), SimpleNamespace(judge=judge)
     fitted = SimpleNamespace(setting={}, loss=0.0)
-    there = SimpleNamespace(setting={mass: (2.0,)}, loss=0.0), {}
-    event = estimator._named_there(*given, fitted, where, there, lambda message: None)
+    event = estimator._named_there(*given, fitted, where, lambda message: None)
     assert (event is not None) == told
     if told:
         assert event.removed == removed and event.candidate is mass
-
-
-@pytest.mark.parametrize(
-    "there, settled, earned, lasts",
-    [
-        ({"map": 1.0}, True, True, True),
-        ({"map": 1.0}, True, False, False),  # it acts there only
-        ({"map": 1.0}, False, True, False),  # it has no value on all windows
-        ({"friction": 0.3}, True, True, False),  # the same set, with other values
-    ],
-)
-def test_what_a_search_finds_in_a_part_competes_everywhere(
-    monkeypatch, there, settled, earned, lasts
-):
-    monkeypatch.setattr(estimator, "said", str)
-    fitted = Set(setting={"friction": 0.2}, loss=-1.0)
-    whole = Set(setting=there, loss=-1.2, settled=settled)
-    search = SimpleNamespace(
-        earned=lambda before, after: earned and (before, after) == (fitted, whole)
-    )
-    judge = SimpleNamespace(fit=lambda setting, near: whole if setting is there else None)
-    part = Set(setting=there), {}
-    kept = estimator._lasting(search, judge, fitted, part, lambda message: None)
-    assert kept is (whole if lasts else None)
-
-
-def test_what_is_found_everywhere_is_told_in_the_place_of_an_event(monkeypatch):
-    """And what is left is looked at once more, with it."""
-    told, asked = [], []
-    search = SimpleNamespace(world=None, train=[])
-    locate = lambda setting, near, passes: f"{near} under {setting}"
-    smoother = SimpleNamespace(locate=locate)
-    found = estimator.Found(Set(setting="friction"), "motion", None, smoother, *[None] * 5)
-
-    def tell(search, found, say, log):
-        told.append(found.trajectory)
-        return Set(fitted=found.fitted, event=None)
-
-    errs = lambda fitted: f"where {fitted.setting} errs"
-    monkeypatch.setattr(estimator, "_told", tell)
-    monkeypatch.setattr(estimator, "concentrated", errs)
-    monkeypatch.setattr(estimator, "_searched", lambda s, fitted, where, log: asked.append(where))
-    lasting = iter([Set(setting="map"), None])
-    monkeypatch.setattr(estimator, "_lasting", lambda *given: next(lasting))
-    monkeypatch.setattr(estimator, "_sometimes", lambda s, found, fitted, where, *o: where)
-    outcome = estimator._outcome(search, found, None, None, None)
-    assert told == ["motion", "motion under map"]
-    assert asked == ["where friction errs", "where map errs"]
-    assert outcome.fitted.setting == "map" and outcome.event == "where map errs"

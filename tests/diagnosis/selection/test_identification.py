@@ -133,30 +133,6 @@ def test_what_is_earned_only_together_stays(search, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "loss, alone, ends",
-    [
-        (-0.99, -1.4, "alone"),  # dear beside what it makes needless
-        (-0.99, -0.9, "both"),  # nothing of it is needless
-        (-1.2, -1.4, "both"),  # worth its price as it is: pruned once it is chosen
-        (-0.6, -1.4, "both"),  # no better: it explains nothing that there was
-    ],
-)
-def test_an_effect_takes_the_place_of_what_it_makes_needless(
-    search, monkeypatch, loss, alone, ends
-):
-    now = fitted(search, ["coulomb_friction"], -1.0)
-    both = fitted(search, ["coulomb_friction", "viscous_damping"], -1.0 - 0.15)
-    both.loss = loss
-    if loss > -0.9:
-        both.score = now.score
-    rest = fitted(search, ["viscous_damping"], alone)
-    monkeypatch.setattr(search, "_missed_least", lambda fitted: list(fitted.setting)[:1])
-    judge = SimpleNamespace(fit=lambda setting, steps, near: rest)
-    ended = search._in_its_place(judge, both, now)
-    assert ended is (rest if ends == "alone" else both)
-
-
-@pytest.mark.parametrize(
     "loss, settled, kept", [(-1.1, True, True), (-0.4, True, False), (-1.1, False, False)]
 )
 def test_a_refit_with_more_steps_has_to_predict_better_what_is_left_out(
@@ -250,8 +226,9 @@ def limited(search, beyond, kept=()):
         setting=lambda n: {some[k]: (1.0,) for k in n.options},
     )
     search._finalists = lambda beam, start, nodes: (nodes, [])
-    score = Score(0.0, np.zeros(4), np.zeros(4), ())
-    now = SimpleNamespace(setting={some[k]: (1.0,) for k in kept}, score=score, loss=1.0)
+    now = SimpleNamespace(
+        setting={some[k]: (1.0,) for k in kept}, score=Score(0.0, np.zeros(4), np.zeros(4), ())
+    )
     judged = search._judged(SimpleNamespace(fit=fit), beam, now)
     assert judged[0] is now and len(judged) == 1 + len(fits)
     return fits
