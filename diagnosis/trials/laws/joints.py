@@ -85,8 +85,10 @@ class CoupledFriction(Law):
 
 
 class CoupledInertia(Law):
-    """A rotor J driven by both joints: kinetic energy J (v_a + v_b)²/2, in the mass matrix, so that it
-    resists dry friction and contacts as well."""
+    """A rotor J driven by both joints: kinetic energy J (v_a + v_b)²/2.
+
+    It is part of the mass matrix, so that dry friction and contacts move it as well.
+    """
 
     effect = "coupled_inertia"
 
