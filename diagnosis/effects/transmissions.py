@@ -30,10 +30,8 @@ from diagnosis.effects.joints import (
 LUGRE_STIFFNESS, LUGRE_LEVELS = 5, slice(3, 6)  # in a dcmotor's dynprm, and in its biasprm
 BRISTLE = 400.0  # 1/s², stiffness over inertia: a bristle to begin with
 STIFFEST = 1.0  # of inertia over a time step squared: stiffer bristles than the step carries
-RELAXES, FASTEST = (
-    2.5,
-    10.0,
-)  # Runge-Kutta's limit of a decay per step; the speed in rad/s or m/s at which it has to hold
+RELAXES = 2.5  # Runge-Kutta's limit of a decay per step
+FASTEST = 10.0  # rad/s or m/s, at which it has to hold
 BENDS = 0.02, 0.07  # share of the travel in which a bristle yields, to try first
 TONES = 2.0, 2.8, 4.0, 5.7, 8.0, 11.3, 16.0  # Hz of an elastic joint, to try first
 DAMPED = 0.1  # its damping ratio
