@@ -66,7 +66,8 @@ class _Follower:
         for j, (i, k) in enumerate(own):
             begun[i][j * n : (j + 1) * n, k] += size[j]
         other = self._followed(begun, 0, last)[1].reshape(len(own), *missed.shape)
-        scale = np.sqrt(np.mean(missed[:, 2:] ** 2, 1, keepdims=True)) + 1e-12
+        count = max(missed.shape[1] - 2, 1)
+        scale = np.sqrt((missed[:, 2:] ** 2).sum(1, keepdims=True) / count) + 1e-12
         off = lambda missed: (missed[..., 2:, :] / scale).reshape(*missed.shape[:-2], -1)
         slopes, off_rest = np.moveaxis(off(other - missed), 0, -1), off(missed)
         gram = np.swapaxes(slopes, 1, 2) @ slopes

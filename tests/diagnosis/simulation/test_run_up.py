@@ -93,3 +93,13 @@ def test_a_gap_in_the_recording_is_run_through(world):
     windows, starts = [Window(some, 30, 39)], (some.qpos[30:31], qvel[kept][30:31])
     predicted = world.simulate([setting], *starts, windows)[0]
     assert np.isfinite(predicted).all()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rows", [2, 4, 12])
+def test_a_short_recording_says_nothing_of_how_it_began(world, rows):
+    setting, run_, qvel = run(world, "joint_elasticity", deflected=0.3)
+    some = Recording("run", *(x[:rows] for x in (run_.time, run_.qpos, run_.qvel, run_.ctrl)))
+    starts = some.qpos[:1], qvel[:1]
+    predicted = world.simulate([setting], *starts, [Window(some, 0, rows - 1)])[0]
+    assert np.isfinite(predicted).all()
