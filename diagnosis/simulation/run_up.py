@@ -4,8 +4,8 @@ recorded.
 qpos, qvel, act = run_up(engine, cases, windows, begin, measures, step)
 
 Each case runs once through each stretch of a recording and is brought back to it every RETURN
-seconds, while what is hidden runs on. How that began, the returns of the first SETTLE seconds tell:
-as with any observer, what is hidden shows in how far they miss.
+seconds, while what is hidden runs on. That begins at rest, or where the returns of the first SETTLE
+seconds speak for it: as with any observer, what is hidden shows in how far they miss.
 """
 
 import mujoco
@@ -124,7 +124,7 @@ def _no_chance(before, after, number):
     left = np.maximum((before != 0).sum(1) - number, 1)
     removed = (before**2).sum(1) - (after**2).sum(1)
     ratio = np.nan_to_num(removed / number * left / np.maximum((after**2).sum(1), 1e-300))
-    return np.array([f_sf(max(r, 0.0), number, n) < LEVEL for r, n in zip(ratio, left)])
+    return f_sf(np.maximum(ratio, 0.0), number, left) < LEVEL
 
 
 def _hidden(engine):

@@ -1,5 +1,6 @@
 """The true system against equations of motion solved by scipy, against stock MuJoCo, and itself."""
 
+import copy
 from dataclasses import replace
 
 import mujoco
@@ -37,14 +38,18 @@ def block(**values):
     return replace(pendulum(), links=(replace(link, **values),))
 
 
-def simulate(robot, laws, ctrl, start, rows=100, row=0.01):
-    system = TrueSystem(robot, laws)
+def readings(system, ctrl, start, rows=100, row=0.01):
+    """What a recording of a joint begun at rest reads, (rows, 2, 1): qpos and qvel."""
     system.reset(np.array([start]), np.zeros(1))
     out = []
     for k in range(rows):
         system.advance(np.array([ctrl(k * row)]), row)
-        out.append(system.reading()[0][0])
+        out.append(system.reading())
     return np.array(out)
+
+
+def simulate(robot, laws, ctrl, start, rows=100, row=0.01):
+    return readings(TrueSystem(robot, laws), ctrl, start, rows, row)[:, 0, 0]
 
 
 def solve(force, ctrl, start, rows=100, row=0.01, extra=()):
@@ -118,18 +123,10 @@ AGAIN = [
 
 @pytest.mark.parametrize("law", AGAIN, ids=lambda law: type(law).__name__)
 def test_a_recording_does_not_remember_the_one_before(law):
-    def recorded(system, start):
-        system.reset(np.array([start]), np.zeros(1))
-        out = []
-        for k in range(30):
-            system.advance(np.array([1.5 * np.cos(0.07 * k)]), 0.01)
-            out.append(system.reading())
-        return np.array(out)
-
-    system = TrueSystem(pendulum(), [law])
-    recorded(system, 1.5)
-    second = recorded(system, -0.4)
-    first = recorded(TrueSystem(pendulum(), [law]), -0.4)
+    ctrl = lambda t: 1.5 * np.cos(7 * t)
+    system, other = TrueSystem(pendulum(), [law]), TrueSystem(pendulum(), [copy.deepcopy(law)])
+    readings(system, ctrl, 1.5, rows=30)
+    second, first = (readings(each, ctrl, -0.4, rows=30) for each in (system, other))
     assert np.abs(first - second).max() == 0.0
 
 
