@@ -15,7 +15,7 @@ FLOORS = (
     ("models", "envs", "diagnosis.common", "diagnosis.effects"),
     ("trpo", "diagnosis.recordings", "diagnosis.simulation", "diagnosis.trials", "diagnosis.demo"),
     ("rgat", "diagnosis.estimation", "diagnosis.nominal", "diagnosis.report", "prove"),
-    ("diagnosis.selection", "diagnosis.handover", "diagnosis.design"),
+    ("diagnosis.selection", "diagnosis.handover", "diagnosis.design", "diagnosis.preparation"),
     ("diagnosis.unnamed",),
     ("diagnosis.findings",),
     ("diagnosis.estimator",),

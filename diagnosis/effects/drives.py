@@ -187,7 +187,7 @@ class RateLimit(DriveLimit):
         pace = np.nan_to_num(np.concatenate(pace))
         fastest = np.quantile(pace[pace > 0], 0.9) if (pace > 0).any() else 0.0
         low, high = (getattr(self.parameters(model, i)[0], f) for f in ("low", "high"))
-        return np.clip(fastest * np.array([[0.7], [0.3], [0.1], [0.03], [0.01]]), low, high)
+        return np.clip(fastest * np.array([[2.0], [0.7], [0.3], [0.1], [0.03]]), low, high)
 
     def command(self, signal, model, i, values):
         return replace(signal, rate=values[0])

@@ -68,21 +68,13 @@ class Identification:
 
     def run(self, setting=None):
         """The Found of all rounds, begun with the nominal model, or with a setting."""
-        self.say(0.0, "locating the missing force")
-        self.smoother = smoother = Smoother(self.world, self.train)
-        first = trajectory = smoother.locate({})
         setting = setting or {}
-        if setting:
-            trajectory = smoother.locate(setting, first, passes=1)
-        known = first.located()[0], (first.qpos, first.qvel), first.force
-        self.usual = Usual(self.world, self.train, smoother.scale, *known)
-        ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
-        self.windows = ahead, Chain(self.world, ahead.windows, smoother.position_noise)
+        trajectory, first = self.locate(setting)
         found = self._rounds(setting, trajectory, first)
         for other in self._elsewhere(found):
             self.log(f" begun elsewhere: {said(other.setting)}")
             search = copy(self)  # what it finds out is kept where it ends better
-            search.smoother, search.missing, search.sets = copy(smoother), None, []
+            search.smoother, search.missing, search.sets = copy(self.smoother), None, []
             start = search.smoother.locate(other.setting, first, passes=1)
             again = search._rounds(other.setting, start, first, rival=found.fitted.setting)
             again = search._better_end(again, found)
@@ -91,7 +83,21 @@ class Identification:
                 vars(self).update(vars(search))
         return replace(found, ranking=self.ranking)
 
-    def _begin(self, setting, trajectory):
+    def locate(self, setting):
+        """(trajectory under a setting, trajectory under the nominal model), by which the windows
+        of the search are cut and what is plausible is known."""
+        self.say(0.0, "locating the missing force")
+        self.smoother = smoother = Smoother(self.world, self.train)
+        first = trajectory = smoother.locate({})
+        if setting:
+            trajectory = smoother.locate(setting, first, passes=1)
+        known = first.located()[0], (first.qpos, first.qvel), first.force
+        self.usual = Usual(self.world, self.train, smoother.scale, *known)
+        ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
+        self.windows = ahead, Chain(self.world, ahead.windows, smoother.position_noise)
+        return trajectory, first
+
+    def begin(self, setting, trajectory):
         """Windows that begin at a trajectory located under a setting."""
         self.ahead, self.screen = (copy(windows) for windows in self.windows)
         self.ahead.start(trajectory, setting)
@@ -102,7 +108,7 @@ class Identification:
         """The Found of rounds begun with a setting, and the trajectory located under it; rival: a
         setting than which each round has to end better, for another."""
         for i in range(ROUNDS):
-            self._begin(setting, trajectory)
+            self.begin(setting, trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
             judge = self.judge()
             most = judge.fit(rival).loss if rival else np.inf
@@ -112,7 +118,7 @@ class Identification:
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory, passes=1)
         else:  # rounds ended with a set from which nothing has begun
-            self._begin(setting, trajectory)
+            self.begin(setting, trajectory)
             judge = self.judge()
             self.missing = MissingForce(self.screen, setting, self.missing)
             fitted = judge.fit(setting)

@@ -162,7 +162,8 @@ def _tied(tried, fitted):
 
 def _alike(judge, missing, candidate, pool, held):
     """[(other, values)] that predict about as well in the candidate's place as far as columns tell,
-    the best first. held: Columns of the set, which stand for those without the candidate.
+    the best first, and of those that are as good the simplest. held: Columns of the set, which
+    stand for those without the candidate.
 
     Asked at the model without the finding, for what is gone there is what the others have to
     explain.
@@ -179,12 +180,13 @@ def _alike(judge, missing, candidate, pool, held):
     for k in set(range(len(options))) - set(kept):
         other, width = options[k].candidate, len(options[k].columns)
         index, low, high, precision, pull = problem(columns, [*kept, k])
-        low[-width:], high[-width:] = -np.inf, np.inf  # its place in the set is not the start's
+        low[-width:], high[-width:] = options[k].reach()  # its place is not the start's
         score = evidence.score(index, low, high, precision, pull)
         if score.loss < min(most, out.get(other, (np.inf,))[0]):
-            amounts = np.clip(score.amounts[-width:], options[k].low, options[k].high)
-            out[other] = score.loss, options[k].values(amounts)
-    return [(c, v) for c, (_, v) in sorted(out.items(), key=lambda item: item[1][0])]
+            out[other] = score.loss, options[k].values(score.amounts[-width:])
+    tied = min((loss for loss, _ in out.values()), default=0.0) + TIED
+    order = lambda c: (out[c][0] > tied, complexity([c]) if out[c][0] <= tied else 0, out[c][0])
+    return [(c, out[c][1]) for c in sorted(out, key=order)]
 
 
 def _near(world, candidate, pool):

@@ -44,6 +44,17 @@ class Start:
         """Whether these are whole values, of which no small share says anything."""
         return bool((self.low > 0).any())
 
+    def reach(self):
+        """Bounds (low, high) (p,) of the amounts within which the values are plausible; its own
+        where no share of it means anything."""
+        if self.merges or (self.low >= self.high).any():
+            return self.low, self.high
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.stack([x - self.base for x in (self.prior.low, self.prior.high)])
+            ends = ends[:, None] / self.directions
+        ends = np.where(self.directions == 0, [[[-np.inf]], [[np.inf]]], ends)
+        return ends.min(0).max(1), ends.max(0).min(1)
+
     def settings(self, setting):
         """A setting with each of the directions."""
         return [{**setting, self.candidate: tuple(self.base + row)} for row in self.directions]

@@ -18,6 +18,7 @@ from contract import contract
 from malformed import cases
 
 from diagnosis import command as diagnose
+from diagnosis import preparation
 from diagnosis.estimation import prediction_error
 from diagnosis.recordings.recording import Recording, RecordingError, accepted
 from diagnosis.report import text as wording
@@ -73,20 +74,20 @@ def recording(rows, name):
 
 def test_split_keeps_back_every_third_or_the_last_part():
     many = [recording(50, f"{k}") for k in range(7)]
-    train, held = diagnose.split(many)
+    train, held = preparation.split(many)
     assert [r.name for r in train] == ["0", "1", "3", "4", "6"] and [r.name for r in held] == [
         "2",
         "5",
     ]
-    train, held = diagnose.split(many[:1])
+    train, held = preparation.split(many[:1])
     assert (
         len(train[0].time) + len(held[0].seen().time) == 50 and 14 <= len(held[0].seen().time) <= 16
     )
     assert held[0].seen().time[0] > train[0].time[-1]
     np.testing.assert_array_equal(held[0].time, many[0].time)  # what led there stays
-    train, held = diagnose.split(many[:2])
+    train, held = preparation.split(many[:2])
     assert [r.name for r in train] == ["0", "1"] == [r.name for r in held]
-    [early], [late] = diagnose.split(
+    [early], [late] = preparation.split(
         [dataclasses.replace(many[0], start=40)]
     )  # one that was held out before
     assert len(early.seen().time) == 35 and len(late.seen().time) == 10
@@ -131,7 +132,7 @@ def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
         mujoco.mj_step(model, data, nstep=5)
     rows = np.array(rows)
     whole = Recording("run.csv", rows[:, 0], rows[:, 1:2], rows[:, 2:3], rows[:, 3:])
-    [early], [tail] = diagnose.split([whole])
+    [early], [tail] = preparation.split([whole])
     world = World(mujoco.MjSpec.from_string(INTEGRATOR))
     error, _ = prediction_error.prediction_error(world, {}, [tail], np.ones(1))
     assert error < 1e-6 and len(prediction_error.consecutive([tail], 0.3)) == 2
@@ -177,11 +178,11 @@ def test_paths_and_recordings_together(tmp_path):
     made = Recording(
         "run.csv", rows[:, 0], rows[:, 1:3], rows[:, 3:5], rows[:, 5:7], {"encoder": rows[:, 1]}
     )
-    [other], [same] = diagnose._recordings([tmp_path / "run.csv"], made, model)
+    [other], [same] = preparation._recordings([tmp_path / "run.csv"], made, model)
     np.testing.assert_allclose(other.qpos, run(seed=1)[:, 1:3], atol=1e-8)
     np.testing.assert_array_equal(same.qpos, made.qpos)
     assert same.name == "held out run.csv" and same.sensors["encoder"].shape == (400, 1)
-    both, none = diagnose._recordings([made, tmp_path / "run.csv"], None, model)
+    both, none = preparation._recordings([made, tmp_path / "run.csv"], None, model)
     assert [(r.name, len(r.time)) for r in both] == [
         ("run.csv", 400),
         ("run.csv (2)", 400),

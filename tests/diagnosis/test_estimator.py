@@ -215,10 +215,22 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
 
 
 @pytest.mark.parametrize(
-    "loss, removed, told", [(-1.0, 0.3, True), (-1.0, -0.05, False), (0.5, 0.3, False)]
+    "loss, removed, bounds, told",
+    [
+        (-1.0, 0.3, (1.0, 3.0), True),
+        (-1.0, -0.05, (1.0, 3.0), False),
+        (0.5, 0.3, (1.0, 3.0), False),
+        (-1.0, 0.3, (0.2, 3.8), False),  # the nominal value is among those that it may have
+    ],
 )
-def test_an_event_removes_error_where_it_is(monkeypatch, loss, removed, told):
-    mass = type("Mass", (), {"effect": SimpleNamespace(numerical=False)})()
+def test_an_event_removes_error_where_it_is_and_has_a_value(
+    monkeypatch, loss, removed, bounds, told
+):
+    kind = {
+        "effect": SimpleNamespace(numerical=False),
+        "parameters": [SimpleNamespace(nominal=0.5)],
+    }
+    mass = type("Mass", (), kind)()
     search = lambda setting, loss: SimpleNamespace(
         fitted=SimpleNamespace(setting=setting, loss=loss),
         candidates=[],
@@ -227,7 +239,7 @@ def test_an_event_removes_error_where_it_is(monkeypatch, loss, removed, told):
     monkeypatch.setattr(estimator, "Identification", lambda *given, log: there)
     monkeypatch.setattr(estimator, "_classes", lambda s, found, fitted, log, all: (fitted, {}))
     monkeypatch.setattr(estimator, "without", lambda fitted, c: fitted)
-    monkeypatch.setattr(estimator, "intervals", lambda fitted: {mass: [(1.0, 3.0)]})
+    monkeypatch.setattr(estimator, "intervals", lambda fitted: {mass: [bounds]})
     judge = SimpleNamespace(fit=lambda setting, steps: SimpleNamespace(setting=setting, loss=loss))
     world = SimpleNamespace(adds_states=lambda c: False)
     where = SimpleNamespace(

@@ -333,6 +333,18 @@ def test_what_a_drive_cannot_give(effect):
     assert abs(run(world, {}, recording, 0.0, 0.0) - expected).max() > 0.05
 
 
+def test_a_limit_above_the_recorded_pace_is_begun_too():
+    """A control is held until the next one: a limit turns its step into a ramp, however slowly the
+    controls change from row to row."""
+    world, recording = World(mujoco.MjSpec.from_string(SERVO)), waves()
+    limit = world.candidate("rate_limit", "m")
+    pace = abs(np.diff(recording.ctrl[:, 0]) / np.diff(recording.time))
+    fastest = max(world.probes(limit, [recording]))
+    assert fastest > pace.max()
+    change = run(world, {limit: fastest}, recording, 0.0, 0.0) - run(world, {}, recording, 0.0, 0.0)
+    assert abs(change).max() > 1e-3
+
+
 def test_a_motor_that_tires_with_its_effort():
     """Its control is less by exp(−rate · ∫ (u/u₀)² dt), by hand; u₀ is the end of its range."""
     xml = PENDULUM.format("implicitfast").replace('name="m"', 'name="m" ctrlrange="-2 2"')

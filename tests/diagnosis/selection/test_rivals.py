@@ -2,12 +2,17 @@
 
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
+from plants import DRIVEN_PENDULUM, recorded
 
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection import rivals
 from diagnosis.selection.criterion import PRICE, Score
+from diagnosis.selection.identification import Identification
+from diagnosis.selection.missing_force import MissingForce
+from diagnosis.simulation.simulator import World
 
 
 class Named:
@@ -168,3 +173,21 @@ def test_a_set_that_stands_for_several_findings_is_told_beside_each():
         DAMPING: [(MASS, (-1.95,)), (ARMATURE, (-1.95,))],
     }
     assert rivals.together(single, BEST, [set_of(-1.5, MASS, ARMATURE)]) == single
+
+
+def test_another_effect_is_begun_at_the_value_that_it_takes_not_near_its_starts(monkeypatch):
+    """Damping of the drive for a little more damping of the joint, where all starts are large."""
+    more = 0.002  # N·m·s/rad
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.01, mass=0.5)))
+    runs = [recorded(f"{k}.csv", k, 0.01 + more, seconds=8.0) for k in (0, 1)]
+    damping = world.candidate("viscous_damping", "pivot")
+    back_emf = world.candidate("back_emf", "drive")
+    search = Identification(world, runs)
+    search.begin({}, search.locate({})[0])
+    judge = search.judge()
+    fitted = judge.fit({damping: (0.01 + more,)})
+    missing = MissingForce(search.screen, {})
+    held = rivals._along(search.screen, judge, fitted.setting)
+    monkeypatch.setattr(rivals, "likely", lambda missing, starts: [s for s in starts if s.whole])
+    [(other, (value,))] = rivals._alike(judge, missing, damping, [back_emf], held)
+    assert other is back_emf and value == pytest.approx(more, rel=0.1)
