@@ -328,7 +328,7 @@ def test_another_end_is_taken_where_it_is_better_and_earned(
 
 def test_rounds_begun_elsewhere_go_on_only_where_they_are_better(search, monkeypatch):
     best, asked = fitted(search, ["armature"], -1.0), []
-    monkeypatch.setattr(search, "_begin", lambda *given: None)
+    monkeypatch.setattr(search, "begin", lambda *given: None)
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
 
     def round_of(setting, judge, most):
