@@ -167,8 +167,10 @@ def form_of(candidate):
 
 
 def certain(candidate, bounds):
-    """Whether the interval of some value leaves out the nominal one."""
-    seen = [(p, b) for p, b in zip(candidate.parameters, bounds) if b is not None]
+    """Whether the interval of some value leaves out the nominal one; of its amplitudes, where an
+    effect has such: the rest means nothing without."""
+    count = candidate.effect.amplitudes or len(candidate.parameters)
+    seen = [(p, b) for p, b in zip(candidate.parameters[:count], bounds) if b is not None]
     return any(not low <= p.nominal <= high for p, (low, high) in seen)
 
 

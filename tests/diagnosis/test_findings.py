@@ -57,6 +57,10 @@ def test_a_finding_whose_intervals_hold_every_nominal_value_is_not_certain():
     assert findings.certain(friction, [(nominal + 0.1, nominal + 0.2)])
     assert not findings.certain(friction, [(nominal, nominal + 0.2)])
     assert not findings.certain(friction, [None])
+    ripple = world.candidate("cogging", "shoulder")
+    poles, phase = (30.0, 31.0), (0.4, 0.5)
+    assert findings.certain(ripple, [(0.1, 0.2), poles, phase])
+    assert not findings.certain(ripple, [(-0.1, 0.2), poles, phase])  # of no amplitude
 
 
 def test_a_mismatch_is_led_by_a_name_and_has_one_that_is_adequate():

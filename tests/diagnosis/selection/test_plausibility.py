@@ -90,6 +90,17 @@ def test_only_a_bound_of_what_is_plausible_is_a_limit_beyond_which_the_truth_may
     assert not at_limit(gain, ends.centre, ends)
 
 
+def test_a_bristle_that_bends_as_far_as_the_joint_travels_is_a_spring():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    usual = Usual(world, [recorded("run.csv", 0)], np.array([0.5]))
+    bristle = world.candidate("presliding", "pivot")
+    prior = plausible(bristle, usual)
+    spring = 0.5 / np.ptp(recorded("run.csv", 0).qpos)
+    assert not at_limit(bristle, (0.1, spring), prior)
+    assert at_limit(bristle, (0.1, 0.001 * spring), prior)
+    assert not possible(bristle, np.array([0.1, 0.001 * spring]), prior)
+
+
 def test_a_force_without_a_name_is_about_as_large_as_what_is_missing():
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     run = recorded("run.csv", 0)
