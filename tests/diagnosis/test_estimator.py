@@ -227,7 +227,7 @@ def test_an_event_removes_error_where_it_is_and_has_a_value(
     monkeypatch, loss, removed, bounds, told
 ):
     kind = {
-        "effect": SimpleNamespace(numerical=False),
+        "effect": SimpleNamespace(numerical=False, amplitudes=0),
         "parameters": [SimpleNamespace(nominal=0.5)],
     }
     mass = type("Mass", (), kind)()
