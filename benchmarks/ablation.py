@@ -135,11 +135,7 @@ def compare(rule, rows, whole):
 def parse():
     """The options of development.py's score, and which rules."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cache", type=Path, required=True, help="drawn trials: development.py")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", help="numbers of trials: 3,8-12")
-    parser.add_argument("--kinds", default=",".join(development.KINDS))
-    parser.add_argument("--free", action="store_true", help="only trials that touch nothing")
+    development.choice(parser)
     parser.add_argument("--rules", help="some of RULES, by commas (all)")
     parser.add_argument("--limit", type=int, default=300, help="processor seconds for a diagnosis")
     parser.add_argument("--jobs", type=int, default=1)

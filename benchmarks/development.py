@@ -211,6 +211,20 @@ def numbers(text):
     return {n for low, _, high in spans for n in range(int(low), int(high or low) + 1)}
 
 
+def where(parser):
+    """Add the options of where drawn trials are."""
+    parser.add_argument("--cache", type=Path, required=True, help="where drawn trials are")
+    parser.add_argument("--seed", type=int, default=1)
+
+
+def choice(parser):
+    """Add the options of chosen()."""
+    where(parser)
+    parser.add_argument("--only", help="numbers of trials: 3,8-12")
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--free", action="store_true", help="only trials that touch nothing")
+
+
 def chosen(options):
     """Numbers and folders of the drawn trials that are to be scored."""
     folders = {int(f.name.split("_")[1]): f for f in options.cache.glob(f"{options.seed}_*")}
@@ -252,14 +266,11 @@ def parse():
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    for name in ("draw", "score"):
-        command = commands.add_parser(name)
-        command.add_argument("--cache", type=Path, required=True, help="where drawn trials are")
-        command.add_argument("--seed", type=int, default=1)
-    commands.choices["draw"].add_argument("--trials", type=int, default=40)
-    command.add_argument("--only", help="numbers of trials: 3,8-12")
-    command.add_argument("--kinds", default=",".join(KINDS))
-    command.add_argument("--free", action="store_true", help="only trials that touch nothing")
+    command = commands.add_parser("draw")
+    where(command)
+    command.add_argument("--trials", type=int, default=40)
+    command = commands.add_parser("score")
+    choice(command)
     command.add_argument("--version", type=Path, default=ROOT, help="folder with a diagnose.py")
     command.add_argument("--tool", help="another command line, see prove.py")
     command.add_argument("--limit", type=int, default=300, help="processor seconds for a diagnosis")

@@ -18,12 +18,12 @@ sys.path.insert(0, str(ROOT))
 
 import numpy as np  # noqa: E402
 
-from benchmarks.development import numbers, place  # noqa: E402
+from benchmarks.development import choice, chosen, place  # noqa: E402
 from benchmarks.rows import append, finished  # noqa: E402
 from diagnosis.preparation import prepared  # noqa: E402
 from diagnosis.selection.adequacy import lacking, share_left  # noqa: E402
 from diagnosis.selection.identification import Identification  # noqa: E402
-from diagnosis.trials.kept import BENCH, is_kept, read_answer  # noqa: E402
+from diagnosis.trials.kept import BENCH, read_answer  # noqa: E402
 
 
 def true_setting(world, answer):
@@ -34,8 +34,7 @@ def true_setting(world, answer):
             candidate = world.candidate(item["effect"], item["place"]["name"])
         except KeyError:
             return None
-        told = {name.replace("-", "_"): v for name, v in item["parameters"].items()}
-        names = [p.name.replace("-", "_") for p in candidate.parameters]
+        told, names = item["parameters"], [p.name for p in candidate.parameters]
         if len(told) == len(names) == 1:
             told = {names[0]: next(iter(told.values()))}
         if not told.keys() <= set(names):
@@ -76,16 +75,12 @@ def judged(folder):
 def main():
     """A row for each drawn trial, as it is done."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cache", type=Path, required=True, help="drawn trials: development.py")
-    parser.add_argument("--only", help="numbers of trials: 3,8-12")
+    choice(parser)
     parser.add_argument("--out", type=Path, required=True, help="CSV; trials in it are kept")
     options = parser.parse_args()
-    for folder in sorted(options.cache.glob("*_*")):
-        number = folder.name.split("_")[1]
-        wanted = not options.only or int(number) in numbers(options.only)
-        if not wanted or not is_kept(folder) or finished(options.out, {"trial": folder.name}):
-            continue
-        row = judged(folder)
+    for _, folder in chosen(options):
+        done = finished(options.out, {"trial": folder.name})
+        row = None if done else judged(folder)
         if row:
             append(options.out, [{"trial": folder.name, **row}])
             print(folder.name, *row.values(), flush=True)

@@ -204,8 +204,10 @@ def _named_there(search, found, fitted, where, log):
     beside = judge.fit({**fitted.setting, placed: values}, steps=0)
     log(f"  {placed} {fitted.loss:.3f} -> {beside.loss:.3f}")
     removed = where.removed(fitted, beside)
+    if beside.loss >= fitted.loss or removed <= 0:
+        return None
     bounds = intervals(best)[most]
-    if beside.loss >= fitted.loss or removed <= 0 or not findings.certain(most, bounds):
+    if not findings.certain(most, bounds):
         return None
     low, high = zip(*(b or (v, v) for b, v in zip(bounds, values)))
     told = placed, values, where.recording, where.time, where.p_value

@@ -76,7 +76,8 @@ TABLE = {
     "servo_stiffness": [("times", 0.25, 0.4, 2.5)],
     "servo_damping": [("times", 0.4, 0.2, 5.0)],
     "coupled_friction": [("force", 0.7, 0.0, 3.0)],
-    "presliding": [("force", 0.7, 0.0, 3.0), ("per travel", np.inf, 0.1, np.inf)],  # or a spring
+    # a softer bristle never yields: it is a spring
+    "presliding": [("force", 0.7, 0.0, 3.0), ("per travel", np.inf, 0.1, np.inf)],
     "coupled_inertia": [("inertia", 0.5, 0.0, 20.0)],
     "gain_fade": [("plain", 0.05, 0.0, 0.5)],
     "unknown": [("missing", 3.0, -20.0, 20.0)],

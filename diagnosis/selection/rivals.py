@@ -185,7 +185,7 @@ def _alike(judge, missing, candidate, pool, held):
         if score.loss < min(most, out.get(other, (np.inf,))[0]):
             out[other] = score.loss, options[k].values(score.amounts[-width:])
     tied = min((loss for loss, _ in out.values()), default=0.0) + TIED
-    order = lambda c: (out[c][0] > tied, complexity([c]) if out[c][0] <= tied else 0, out[c][0])
+    order = lambda c: (max(out[c][0], tied), complexity([c]), out[c][0])
     return [(c, out[c][1]) for c in sorted(out, key=order)]
 
 

@@ -49,11 +49,7 @@ class Start:
         where no share of it means anything."""
         if self.merges or (self.low >= self.high).any():
             return self.low, self.high
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = np.stack([x - self.base for x in (self.prior.low, self.prior.high)])
-            ends = ends[:, None] / self.directions
-        ends = np.where(self.directions == 0, [[[-np.inf]], [[np.inf]]], ends)
-        return ends.min(0).max(1), ends.max(0).min(1)
+        return _reach(self.base, self.directions, self.prior)
 
     def settings(self, setting):
         """A setting with each of the directions."""
@@ -190,9 +186,17 @@ def _proportional(candidate, base, prior, shown):
     fits = (base + steps <= prior.high) & (base + steps >= prior.low) & np.isfinite(base) & shown
     if not fits.any():
         return None
-    ends = np.stack([(prior.low - base) / steps, (prior.high - base) / steps])
-    low, high = ends.min(0)[fits], ends.max(0)[fits]
-    return Start(candidate, base, np.diag(steps)[fits], low, high, prior)
+    directions = np.diag(steps)[fits]
+    return Start(candidate, base, directions, *_reach(base, directions, prior), prior)
+
+
+def _reach(base, directions, prior):
+    """Bounds (low, high) (p,) of amounts of directions (p, k) from a base (k,), between which the
+    values lie within a Prior."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([prior.low - base, prior.high - base])[:, None] / directions
+    ends = np.where(directions == 0, [[[-np.inf]], [[np.inf]]], ends)
+    return ends.min(0).max(1), ends.max(0).min(1)
 
 
 def applied(model, qpos, qvel, working):

@@ -15,7 +15,7 @@ def hidden(effect, place, **parameters):
 @pytest.mark.parametrize(
     "item, values",
     [
-        (hidden("dead_zone", "drive", **{"half-width": 0.2}), (0.2,)),
+        (hidden("dead_zone", "drive", half_width=0.2), (0.2,)),
         (hidden("load_friction", "pivot", driving=0.1, driven=0.3), (0.1, 0.3, 1.0)),
         (hidden("gain", "drive", anything=0.8), (0.8,)),
         (hidden("load_friction", "pivot", driving=0.1, teeth=12), None),

@@ -90,7 +90,7 @@ def test_only_a_bound_of_what_is_plausible_is_a_limit_beyond_which_the_truth_may
     assert not at_limit(gain, ends.centre, ends)
 
 
-def test_a_bristle_that_bends_as_far_as_the_joint_travels_is_a_spring():
+def test_a_bristle_that_bends_much_farther_than_the_joint_travels_is_a_spring():
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     usual = Usual(world, [recorded("run.csv", 0)], np.array([0.5]))
     bristle = world.candidate("presliding", "pivot")
