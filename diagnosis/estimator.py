@@ -115,7 +115,8 @@ def _undisturbed(search, found, event):
         return search, found, None
     if before < after:
         again = replace(again, fitted=again.judge.fit(found.fitted.setting))
-    return calm, again, event
+    here = calm.smoother.locate(again.fitted.setting, again.trajectory, passes=1)
+    return calm, replace(again, trajectory=here), event
 
 
 def _everywhere(search, judge, setting, event):

@@ -87,14 +87,12 @@ class Check:
         predicted = files.predicted(model, self.windows)
         return windowing.error(model, self.windows, predicted, self.noise)
 
-    def smoothed(self, setting):
+    def smoothed(self, setting, near=False):
         """The windows, begun at the motion that is located under a setting: noise of start states
         as recorded moves a prediction by more than many an effect does, and so do those that
-        another setting located."""
-        near = self.path is not None
-        self.path = copy(self.smoother).locate(
-            setting, self.path, passes=2 if near else 3, near=near
-        )
+        another setting located. near: to the setting that was asked for last (see Smoother)."""
+        passes = 2 if self.path else 3
+        self.path = copy(self.smoother).locate(setting, self.path, passes, near)
         path, begun = self.path, {}
         for r in self.recordings:
             rows = path.rows(r)
@@ -108,10 +106,11 @@ class Check:
         known = windowing.known(self.world.model, self.windows)[:, 1:]
         return SCATTER * np.sqrt(2 * known[..., self.told].sum()) / max(known.sum(), 1)
 
-    def squares(self, files, setting):
+    def squares(self, files, setting, near=False):
         """Parts of the squared error of the Files of a setting (2, W), by window: from start states
         as recorded, and as they are smoothed under it; infinite where they do not run."""
-        return np.array([self._parts(files, w) for w in (self.windows, self.smoothed(setting))])
+        begun = self.windows, self.smoothed(setting, near)
+        return np.array([self._parts(files, windows) for windows in begun])
 
     def worse(self, setting, other):
         """By how much a setting's files predict worse than another one's, at least."""
@@ -148,7 +147,7 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
         rest = {o: {c: v for c, v in setting.items() if c is not o} for o in setting}
         less = {out: Files.of(world, others) for out, others in rest.items()}
         worse = {
-            c: _worse(after, check.squares(less[c], rest[c]), uncounted=1)
+            c: _worse(after, check.squares(less[c], rest[c], near=True), uncounted=1)
             for c in setting
             if files.forms[c] in ("mjcf", "python")
         }

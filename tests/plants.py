@@ -1,5 +1,7 @@
 """Mechanisms, recordings and the plain loop that the tests of effects and simulator share."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 
@@ -175,6 +177,68 @@ PENDULUM = """
 
 def pendulum(integrator="implicitfast"):
     return World(mujoco.MjSpec.from_string(PENDULUM.format(integrator)))
+
+
+def driven_by(actuator):
+    """The pendulum with another actuator "m" on its joint "j": World, MJCF."""
+    xml = PENDULUM.replace('<motor name="m" joint="j"/>', actuator).format("implicitfast")
+    return World(mujoco.MjSpec.from_string(xml)), xml
+
+
+def tight():
+    """World of the pendulum on a stiff position servo, whose joint passes 1 N·m on at most."""
+    _, xml = driven_by('<position name="m" joint="j" kp="50"/>')
+    limited = xml.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-1 1"')
+    return World(mujoco.MjSpec.from_string(limited))
+
+
+# what is left of a force F of such a servo at a speed v and a time t
+WEAKER = {
+    "gain_fade": ((9.0,), lambda F, v, t: F * np.exp(-9.0 * t)),
+    "torque_speed": (
+        (0.5, 1.5),
+        lambda F, v, t: np.where(F * v > 0, np.sign(F) * np.clip(1.5 - 0.5 * abs(v), 0, abs(F)), F),
+    ),
+}
+
+
+def stepped():
+    """World of a servo of 50 N·m at most, and a run in which its goal steps by 1.5 rad, and its
+    joint follows at 2 rad/s."""
+    world, _ = driven_by('<position name="m" joint="j" kp="1000" forcerange="-50 50"/>')
+    time = 0.01 * np.arange(400)
+    up, moved = time % 2 >= 1, 2.0 * np.clip(time % 1, 0, 0.75)
+    angle = np.where(up, moved, 1.5 - moved)[:, None]
+    return world, replace(commanded(time, 1.5 * up[:, None]), qpos=angle)
+
+
+FILTER = '<general name="m" joint="j" dyntype="filterexact" dynprm="0.05"/>'
+INTEGRATOR = '<intvelocity name="m" joint="j" kp="3" actrange="-0.3 0.3"/>'
+
+
+def there_and_back(world):
+    """A run in stock MuJoCo of an actuator asked for 1 per second for 0.8 s, then for -1: its
+    Recording, qpos and qvel (120, 1)."""
+    ctrl = np.where(np.arange(120) < 80, 1.0, -1.0)[:, None]
+    data, states = mujoco.MjData(world.model), []
+    for control in ctrl:
+        states.append((data.qpos.copy(), data.qvel.copy()))
+        data.ctrl[:] = control
+        mujoco.mj_step(world.model, data, nstep=10)
+    return commanded(0.01 * np.arange(120), ctrl), *map(np.array, zip(*states))
+
+
+def on_spring(stiff=100.0, rest=0.0):
+    """World of an undriven wheel on a spring, and a run at 5 Hz and 0.05 rad about where that is at
+    rest, in rad."""
+    inertia = stiff / (10 * np.pi) ** 2
+    xml = f"""<mujoco><compiler angle="radian"/><option timestep="0.001"/><worldbody><body>
+        <joint name="j" axis="0 0 1" stiffness="{stiff}" springref="{rest}"/>
+        <inertial pos="0 0 0" mass="1" diaginertia="{inertia} {inertia} {inertia}"/></body>
+        </worldbody></mujoco>"""
+    time = 0.01 * np.arange(400)
+    angle = rest + 0.05 * np.cos(10 * np.pi * time)[:, None]
+    return World(mujoco.MjSpec.from_string(xml)), replace(commanded(time), qpos=angle)
 
 
 DROP = """<mujoco><option timestep="0.002"/><worldbody>

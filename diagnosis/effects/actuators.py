@@ -54,7 +54,8 @@ class ActuatorEffect(Effect):
 
     @staticmethod
     def forces(model, i, recordings):
-        """|force| that the recorded controls asked for, but for velocity feedback."""
+        """|force| that the recorded controls asked for, but for velocity feedback, and got within
+        the model's limits."""
         asked = [
             model.actuator_gainprm[i, 0] * r.ctrl[:, model.actuator_ctrladr[i]] for r in recordings
         ]
@@ -62,7 +63,17 @@ class ActuatorEffect(Effect):
             q = model.jnt_qposadr[model.actuator_trnid[i, 0]]
             k = model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0]
             asked = [F + k * r.qpos[:, q] for F, r in zip(asked, recordings)]
-        return abs(np.nan_to_num(np.concatenate(asked)))
+        return abs(ActuatorEffect.limited(model, i, np.nan_to_num(np.concatenate(asked))))
+
+    @staticmethod
+    def limited(model, i, force):
+        """A force of the actuator within its own limits, and those of the joint that it acts on."""
+        if model.actuator_forcelimited[i]:
+            force = np.clip(force, *model.actuator_forcerange[i])
+        j, gear = model.actuator_trnid[i, 0], model.actuator_gear[i, 0]
+        if ActuatorEffect.on_joint(model, i) and model.jnt_actfrclimited[j] and gear:
+            force = np.clip(force, *np.sort(model.jnt_actfrcrange[j] / gear))
+        return force
 
     @staticmethod
     def unit(model, i):
@@ -272,9 +283,10 @@ class Saturation(ActuatorEffect):
 
     def probes(self, model, i, recordings):
         used = self.forces(model, i, recordings).max()
-        return (
-            used * np.array([[0.9], [0.7], [0.5], [0.3], [0.1]]) if used > 0 else np.zeros((0, 1))
-        )
+        below = used * np.array([0.9, 0.7, 0.5, 0.3, 0.1, 0.03]) if used > 0 else []
+        (limit,) = (p.nominal for p in self.parameters(model, i))
+        above = [1.4 * limit, 2 * limit] if np.isfinite(limit) else []
+        return np.array([*below, *above])[:, None]
 
     @staticmethod
     def limits(model, i, value):
@@ -369,6 +381,10 @@ class Delay(ActuatorEffect):
 
 
 def nominal_delay(model, i):
-    """Seconds by which the nominal model delays actuator i: MuJoCo rounds a part of a step up to
-    one."""
-    return max(model.actuator_delay[i], model.opt.timestep) if model.actuator_delay[i] > 0 else 0.0
+    """Seconds by which the nominal model delays actuator i: MuJoCo takes a part of a step for one,
+    and every delay for whole steps where it does not interpolate."""
+    delay, step = model.actuator_delay[i], model.opt.timestep
+    if delay <= 0:
+        return 0.0
+    held = model.actuator_history[i, 1] == 0
+    return float(step * np.ceil(delay / step - 1e-9)) if held else max(delay, step)

@@ -8,7 +8,6 @@ overrides it:
     force     a force that depends on the state    measure  the sensor
     limit     dry friction that depends on it      probes   values worth a try
     write     the same in MJCF                     far      values to try at full size
-    suited    steps for the motion recorded
 
 Values are absolute, in SI units, with the sign of the MJCF field. A new effect is one class with
 the decorator @catalogue, and no other line.
@@ -30,7 +29,7 @@ HINGE, SLIDE, BALL = (
 )
 JOINT_TRANSMISSION = int(mujoco.mjtTrn.mjTRN_JOINT)
 JOINT_TRANSMISSIONS = JOINT_TRANSMISSION, int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-HUGE = 1e6  # upper bound where physics gives none, in units of the effect's own scale
+HUGE = 1e12  # upper bound where physics gives none, in units of the effect's own scale
 EFFECTS = []  # the catalogue, one instance of each class; effects are applied in this order
 
 
@@ -169,13 +168,13 @@ class Effect:
         in proportion."""
         return ()
 
-    def suited(self, parameters, model, i, recordings):
-        """The parameters with steps and bounds that suit the recorded motion."""
-        return parameters
-
     def possible(self, values, nominal):
         """Whether a real machine can have these values, and not another effect by this name."""
         return True
+
+    def twin(self, model, i):
+        """Name of another place where the effect has the same numbers, or None."""
+        return None
 
     def build(self, spec, model, i):
         """Add to spec (of the nominal model) what edit() sizes."""

@@ -43,17 +43,31 @@ def actuator_force(models, a):
 def lost(models, a, change):
     """Function as of Effect.force: what change(force, speed, time) adds to the force of actuator a.
 
-    force, speed (S,) of the actuator; the result acts on its joint.
+    force, speed (S,) of the actuator; the result acts on its joint, within whose actuatorfrcrange
+    the drives stay.
     """
     model, force = models[0], actuator_force(models, a)
-    d, gear = model.jnt_dofadr[model.actuator_trnid[a, 0]], model.actuator_gear[a, 0]
+    j, gear = model.actuator_trnid[a, 0], model.actuator_gear[a, 0]
+    d, within = model.jnt_dofadr[j], joint_limit(models, j)
+    others = [(model.actuator_gear[b, 0], actuator_force(models, b)) for b in drives_of(model, j)]
 
     def function(qpos, qvel, ctrl, time):
-        out = np.zeros_like(qvel)
-        out[:, d] = gear * change(force(qpos, qvel, ctrl), gear * qvel[:, d], time)
+        out, state = np.zeros_like(qvel), (qpos, qvel, ctrl)
+        lost = gear * change(force(*state), gear * qvel[:, d], time)
+        whole = sum(g * other(*state) for g, other in others)
+        out[:, d] = within(whole + lost) - within(whole)
         return out
 
     return function
+
+
+def joint_limit(models, j):
+    """Function (S,) -> (S,): the force of joint j's drives within its actuatorfrcrange."""
+    free = -np.inf, np.inf
+    low, high = np.array(
+        [m.jnt_actfrcrange[j] if m.jnt_actfrclimited[j] else free for m in models]
+    ).T
+    return lambda force: np.clip(force, low, high)
 
 
 def drives_of(model, j):
@@ -75,16 +89,8 @@ def drive_torque(models, j):
     """Function (qpos, qvel, ctrl) -> (S,) force of all the drives of joint j, in its coordinate."""
     model = models[0]
     forces = [(model.actuator_gear[a, 0], actuator_force(models, a)) for a in drives_of(model, j)]
-    free = -np.inf, np.inf
-    low, high = np.array(
-        [m.jnt_actfrcrange[j] if m.jnt_actfrclimited[j] else free for m in models]
-    ).T
-
-    def torque(qpos, qvel, ctrl):
-        total = sum(gear * force(qpos, qvel, ctrl) for gear, force in forces)
-        return np.clip(total, low, high)
-
-    return torque
+    within = joint_limit(models, j)
+    return lambda qpos, qvel, ctrl: within(sum(g * force(qpos, qvel, ctrl) for g, force in forces))
 
 
 @catalogue
@@ -186,8 +192,19 @@ class RateLimit(DriveLimit):
         pace = [abs(np.diff(r.ctrl[:, u]) / np.diff(r.time)) for r in recordings]
         pace = np.nan_to_num(np.concatenate(pace))
         fastest = np.quantile(pace[pace > 0], 0.9) if (pace > 0).any() else 0.0
+        rates = fastest * np.array([2.0, 0.7, 0.3, 0.1, 0.03])
+        rates = [*rates, *self._followed(model, i, recordings)]
         low, high = (getattr(self.parameters(model, i)[0], f) for f in ("low", "high"))
-        return np.clip(fastest * np.array([[2.0], [0.7], [0.3], [0.1], [0.03]]), low, high)
+        return np.clip(rates, low, high)[:, None]
+
+    def _followed(self, model, i, recordings):
+        """Rates at which the control would have to change for a position servo to move as it did:
+        steps of a goal have no pace of their own."""
+        stiff = abs(model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0])
+        _, speed = JointEffect.travel(model, model.actuator_trnid[i, 0], recordings)
+        if not stiff or not len(speed):
+            return []
+        return stiff / abs(model.actuator_gainprm[i, 0]) * np.quantile(speed, [0.5, 0.95]) + 1e-9
 
     def command(self, signal, model, i, values):
         return replace(signal, rate=values[0])

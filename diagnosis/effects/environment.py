@@ -168,6 +168,9 @@ class ContactEffect(Effect):
         static = model.body_weldid[model.geom_bodyid] == 0
         return int(np.argmax(np.where(meets, model.geom_friction[:, 0] + 1e6 * static, -1.0)))
 
+    def twin(self, model, i):
+        return model.geom(self.partner(model, i)).name
+
     @classmethod
     def pair(cls, model, i):
         """What geom i's contacts have nominally: condim, friction (3,), solref (2,), solimp

@@ -5,8 +5,6 @@ sets the level anew before each step (see Effect.limit), and beside corrected.xm
 (corrected.py).
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from diagnosis.effects.base import (
@@ -53,32 +51,18 @@ class StribeckFriction(JointEffect):
 
     def parameters(self, model, i):
         M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
+        held = float(model.dof_frictionloss[model.jnt_dofadr[i]])
         return (
-            Parameter("coulomb", force, 0.0, 0.0, HUGE * M, 0.05 * M),
-            Parameter("static", force, 0.0, 0.0, HUGE * M, 0.05 * M),
+            Parameter("coulomb", force, held, 0.0, HUGE * M + held, 0.05 * M),
+            Parameter("static", force, held, 0.0, HUGE * M + held, 0.05 * M),
             Parameter("velocity", self.unit(model, i, "rad/s", "m/s"), 0.1, 1e-4, 100.0, 0.01),
-        )
-
-    def suited(self, parameters, model, i, recordings):
-        """It has fallen at the speeds that are reached: what still falls there is another law of
-        friction."""
-        coulomb, static, velocity = parameters
-        _, speed = self.travel(model, i, recordings)
-        return (
-            coulomb,
-            static,
-            replace(
-                velocity,
-                high=max(
-                    velocity.nominal, np.quantile(speed, 0.5) + 1e-4, 0.5 * np.quantile(speed, 0.98)
-                ),
-            ),
         )
 
     def probes(self, model, i, recordings):
         step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
         slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
-        return np.array([(step, ratio * step, v) for v in slow for ratio in (1.5, 3.0)])
+        held = float(model.dof_frictionloss[model.jnt_dofadr[i]])
+        return np.array([(held + step, held + r * step, v) for v in slow for r in (1.5, 3.0)])
 
     def possible(self, values, nominal):
         """It falls with speed, by enough to matter, and not to nothing."""
@@ -216,12 +200,6 @@ class FrictionMap(DryFriction):
             Parameter("waves", self.unit(model, i, "1", "rad/m"), 6.0, 0.1, 1e6, 0.1),
             Parameter("phase", "rad", 0.0, -10.0, 10.0, 0.1),
         )
-
-    def suited(self, parameters, model, i, recordings):
-        """At least one wave within the recorded travel: less may be of any shape."""
-        level, contrast, waves, phase = parameters
-        least = 2 * np.pi / self._travelled(model, i, recordings)
-        return level, contrast, replace(waves, low=min(max(waves.low, least), waves.high)), phase
 
     def _travelled(self, model, i, recordings):
         position, _ = self.travel(model, i, recordings)

@@ -1,8 +1,6 @@
 """Effects in a joint: a hinge or slide, some in a ball joint too. Their scales follow the joint's
 own inertia."""
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 
@@ -103,18 +101,6 @@ class JointNumber(JointEffect):
         step = max(self.step * M, 0.01 * abs(nominal))
         return (Parameter(name, self.unit(model, i, *units), nominal, low, HUGE * M, step),)
 
-    @staticmethod
-    def scaled(parameter, size):
-        """The parameter with a step and bounds that are the usual forces where it acts `size`
-        times as much as at one."""
-        p = parameter
-        return replace(
-            p,
-            step=max(p.step / size, 0.01 * abs(p.nominal)),
-            low=min(p.low, p.low / size),
-            high=max(p.high, p.high / size),
-        )
-
     def edit(self, model, i, values):
         field, k = self._field(model, i)
         field[k] = values[0]
@@ -168,9 +154,6 @@ class QuadraticDamping(JointNumber):
         ("dof_dampingpoly", 0),
         ("damping", 1),
     )
-
-    def suited(self, parameters, model, i, recordings):
-        return (self.scaled(parameters[0], self.reach(model, i, recordings)[1]),)
 
     def far(self, model, i, recordings):
         farthest, _ = self.reach(model, i, recordings)
@@ -233,9 +216,6 @@ class NonlinearStiffness(JointNumber):
         ("stiffness", 2),
     )
     step, signed = 0.1, True
-
-    def suited(self, parameters, model, i, recordings):
-        return (self.scaled(parameters[0], self.reach(model, i, recordings)[0] ** 2),)
 
     def far(self, model, i, recordings):
         farthest, fastest = self.reach(model, i, recordings)
@@ -300,16 +280,6 @@ class Cogging(JointEffect):
             Parameter("phase", "rad", 0.0, -10.0, 10.0, 0.1),
         )
 
-    def suited(self, parameters, model, i, recordings):
-        """At least one whole wave within the recorded travel: less is only a bent spring."""
-        amplitude, poles, phase = parameters
-        travel = np.ptp(self.travel(model, i, recordings)[0])
-        return (
-            amplitude,
-            replace(poles, low=min(max(poles.low, 2 * np.pi / max(travel, 1e-9)), poles.high)),
-            phase,
-        )
-
     def probes(self, model, i, recordings):
         """Ripples close enough to each other for one of them to stay in step over the whole
         travel."""
@@ -356,23 +326,24 @@ class JointStop(JointEffect):
     name, simplicity = "joint_stop", 2
     acts_through = "position"
     NEVER = 1e5  # a bound that far away is never met
-    NONE = 1e6  # where a side without a stop is begun
 
     def parameters(self, model, i):
         low, high = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
         unit = self.unit(model, i, "rad", "m")
         return (
-            Parameter("low", unit, low, -2 * self.NONE, 2 * self.NONE, 0.01),
-            Parameter("high", unit, high, -2 * self.NONE, 2 * self.NONE, -0.01),
+            Parameter("low", unit, low, -10 * self.NEVER, 10 * self.NEVER, 0.01),
+            Parameter("high", unit, high, -10 * self.NEVER, 10 * self.NEVER, -0.01),
         )
 
     def probes(self, model, i, recordings):
         position, _ = self.travel(model, i, recordings)
         low, high = (p.nominal for p in self.parameters(model, i))
-        a, b, c, d = np.quantile(position, [0.03, 0.15, 0.85, 0.97])
+        least, a, b, c, d, most = np.quantile(position, [0, 0.03, 0.15, 0.85, 0.97, 1])
         both = [(x, y) for x, y in ((a, d), (b, c)) if x > low and y < high]
-        starts = [(x, high) for x in (a, b) if x > low] + [(low, x) for x in (c, d) if x < high]
-        return np.clip(np.array(starts + both).reshape(-1, 2), -self.NONE, self.NONE)
+        # a side without a stop begins at the farthest position: from there on it may move
+        bottom, top = np.where(np.isfinite([low, high]), [low, high], [least, most])
+        starts = [(x, top) for x in (a, b) if x > low] + [(bottom, x) for x in (c, d) if x < high]
+        return np.array(starts + both).reshape(-1, 2)
 
     def edit(self, model, i, values):
         model.jnt_limited[i] = True

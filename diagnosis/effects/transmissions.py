@@ -4,8 +4,6 @@ rotors and belts.
 All have an MJCF form, with parts that the nominal model lacks (see Effect.build).
 """
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 
@@ -65,10 +63,6 @@ class Presliding(JointEffect):
                 "stiffness", unit, stiffness, 1e-4 * stiffness, self._stiffest(model, i), 0.1 * M
             ),
         )
-
-    def suited(self, parameters, model, i, recordings):
-        level, stiffness = parameters
-        return level, replace(stiffness, step=max(stiffness.step, 0.05 * stiffness.nominal))
 
     def probes(self, model, i, recordings):
         position, _ = self.travel(model, i, recordings)

@@ -22,6 +22,7 @@ from diagnosis.effects.joints import JointEffect
 CLOSE = 0.05  # of a curve's range, by which a polynomial may miss it
 BEYOND = 3.0  # times its largest force, at most, at half the travel beyond it
 BETWEEN = 10  # points looked at between two knots
+MOVING = {"velocity": np.sign, "speed": np.abs, "damping": np.array}  # of a joint's velocity
 FAR = 1e3  # times the travel, where the highest power decides
 
 
@@ -31,8 +32,9 @@ class Unknown(JointEffect):
 
     variable: 'position:<joint>', 'velocity:<joint>', 'control:<actuator>', 'load:<joint>' (the
     force of its drives) or 'time'. factor: None, or what the curve is multiplied by:
-    'control:<actuator>' for what it is asked for (see asked), 'velocity:<joint>' for its sign, or
-    'speed:<joint>' for its size. wave: a sine through two knots, a quarter of its period apart.
+    'control:<actuator>' for what it is asked for (see asked), 'velocity:<joint>' for its sign,
+    'speed:<joint>' for its size, or 'damping:<joint>' for both. wave: a sine through two knots, a
+    quarter of its period apart.
     """
 
     name, kind, simplicity = "unknown", "joint", 4
@@ -57,13 +59,14 @@ class Unknown(JointEffect):
     @property
     def depends_on(self):
         """What the force varies with, in the contract's words."""
-        factor = (self.factor or "").replace("speed:", "velocity:")
+        kind, _, name = (self.factor or "").partition(":")
+        factor = f"velocity:{name}" if kind in MOVING else self.factor
         return tuple(dict.fromkeys(v for v in (self.variable, factor) if v))
 
     def parameters(self, model, i):
         M = self.scale(model, i)
         force = self.unit(model, i, "N·m", "N")
-        if (self.factor or "").startswith("speed"):
+        if (self.factor or "").startswith(("speed", "damping")):
             force = self.unit(model, i, "N·m·s/rad", "N·s/m")
         return tuple(
             Parameter(f"force {k}", force, 0.0, -HUGE * M, HUGE * M, 0.05 * M)
@@ -90,17 +93,17 @@ class Unknown(JointEffect):
             x, out = read(self.variable, *state), np.zeros_like(state[1])
             out[:, d] = self.at(x, values)
             if self.factor:
-                out[:, d] *= self._times(model, read, state)
+                out[:, d] *= self._times(models, read, state)
             return out
 
         return curve
 
-    def _times(self, model, read, state):
+    def _times(self, models, read, state):
         """The factor (n,) at states."""
         kind, _, name = self.factor.partition(":")
         if kind == "control":
-            return asked(model, model.actuator(name).id, *state[:3])
-        return (abs if kind == "speed" else np.sign)(read(f"velocity:{name}", *state))
+            return asked(models, models[0].actuator(name).id, *state[:3])
+        return MOVING[kind](read(f"velocity:{name}", *state))
 
     def part(self, model, i, values):
         numbers = {
@@ -199,16 +202,15 @@ def holds(force, x, y, zero):
     return bool(below >= -most and above <= most)
 
 
-def asked(model, a, qpos, qvel, ctrl):
+def asked(models, a, qpos, qvel, ctrl):
     """(n,) control of an actuator on a hinge or slide; of a servo, less where it already is: its
-    nominal force over its gain."""
-    u, gain, bias = (
-        ctrl[..., model.actuator_ctrladr[a]],
-        model.actuator_gainprm[a, 0],
-        model.actuator_biasprm[a],
-    )
-    if model.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_AFFINE or not gain:
+    force without a limit over its gain. models: one for each row, or one for all."""
+    model = models[0]
+    u = ctrl[..., model.actuator_ctrladr[a]]
+    gain = np.array([m.actuator_gainprm[a, 0] for m in models])
+    if model.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_AFFINE or not gain.all():
         return u
+    bias = np.array([m.actuator_biasprm[a, :3] for m in models]).T
     j, gear = model.actuator_trnid[a, 0], model.actuator_gear[a, 0]
     q, v = qpos[..., model.jnt_qposadr[j]], qvel[..., model.jnt_dofadr[j]]
     return u + (bias[0] + gear * (bias[1] * q + bias[2] * v)) / gain

@@ -28,6 +28,7 @@ PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates 
 MOST = 10.0  # factor of a variance in one update
 LOUDER = 20.0  # noise is at most so many times what differences of readings show
 REACH = 2.0  # deviations of a position, within which something may touch
+STILL = 1e-6  # rad or m, and per second: noise of readings that are always the same
 WANDERS = 0.3  # share of a joint's usual forces by which w first may wander in 0.1 s
 
 
@@ -129,7 +130,9 @@ class Smoother:
         position, velocity = measurement_noise(self.model, recordings)
         floor = np.concatenate([position, velocity])
         self.told = np.isfinite(floor)  # channels of which there is enough to tell their noise
-        return np.where(np.isfinite(floor), np.maximum(floor, 1e-12) ** 2, 1.0)
+        known = np.isfinite(np.concatenate([self.position, self.velocity], 1)).any(0)
+        still = np.where(known, STILL, 1.0)
+        return np.where(self.told, np.maximum(floor, 1e-12), still) ** 2
 
     def _noise(self):
         nv, out = self.model.nv, np.sqrt(self.R)
@@ -150,7 +153,7 @@ class Smoother:
         for row in some:
             data.qpos[:], data.qvel[:] = self.qpos[row], self.qvel[row]
             mujoco.mj_forward(model, data)
-            held.append(abs(data.qfrc_bias) + abs(data.qfrc_actuator))
+            held.append(abs(data.qfrc_bias) + abs(data.qfrc_actuator) + abs(data.qfrc_passive))
         speed = np.quantile(abs(self.qvel), 0.7, axis=0)
         scale = np.mean(held, axis=0) + model.dof_M0 * (speed + 1e-3) / 0.2
         return np.maximum(scale, 1e-3 * scale.max())

@@ -148,7 +148,8 @@ class Columns:
         """Keep which parameters of a candidate show at all, so that later columns leave out the
         others."""
         single = (start.directions != 0).sum(1) == 1
-        new = start.candidate not in self.seen
+        # of what is begun at whole values, others may show what these do not
+        new = start.candidate not in self.seen and not start.candidate.effect.overrides("probes")
         if single.all() and new and len(single) > 1 and shows.any():
             self.seen[start.candidate] = (start.directions[shows] != 0).any(0)
 
@@ -164,7 +165,8 @@ class Columns:
         A small step of what sticks, saturates or is late by less than a row says little of a large
         one.
         """
-        single = lambda o: len(o.columns) == 1 and not o.merges and o.candidate not in self.setting
+        moves = lambda o: not o.merges and (o.low < o.high).all()
+        single = lambda o: len(o.columns) == 1 and moves(o) and o.candidate not in self.setting
         some = [o for o in self.options if single(o)]
         found = evidence.scores([(o.columns, o.low, o.high, *o.quadratic()) for o in some])
         moved = [(score, o) for score, o in zip(found, some) if abs(score.amounts[0]) > 1e-9]

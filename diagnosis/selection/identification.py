@@ -152,7 +152,10 @@ class Identification:
         fitted = self.pruned(judge, again.fitted, nothing)
         self.log(f" ends {fitted.loss:.3f}, before {before.loss:.3f}")
         better = fitted.settled and fitted.loss < before.loss - TIED
-        return replace(again, fitted=fitted) if better and self.earned(nothing, fitted) else None
+        if not better or not self.earned(nothing, fitted):
+            return None
+        here = again.smoother.locate(fitted.setting, again.trajectory, passes=1)
+        return replace(again, fitted=fitted, trajectory=here)
 
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
@@ -342,10 +345,13 @@ class Identification:
         return fitted if fitted is whole else judge.fit(fitted.setting)
 
     def _missed_least(self, fitted):
-        """Up to TRIED effects of a set that may not earn their place."""
+        """Effects of a set that may not earn their place: up to TRIED, and limits, of which small
+        changes tell nothing."""
         left = {c: without(fitted, c) for c in fitted.setting}
         some = [c for c in left if not self.earned(left[c], fitted)]
-        return sorted(some, key=lambda c: left[c].loss)[:TRIED]
+        some.sort(key=lambda c: left[c].loss)
+        limits = sum(np.isinf(left[c].loss) for c in some)
+        return some[: limits + TRIED]
 
     @staticmethod
     def _ranking(beam):

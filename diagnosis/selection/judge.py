@@ -186,10 +186,16 @@ def without(fitted, candidate):
 
 
 def changing(judge, fitted):
-    """A Fitted set without the effects whose values became the nominal ones."""
-    same = [c for c, v in fitted.setting.items() if np.allclose(v, c.nominal, rtol=1e-6, atol=0)]
-    rest = {c: v for c, v in fitted.setting.items() if c not in same}
-    return judge.fit(rest, steps=0) if same else fitted
+    """A Fitted set without the effects whose values became the nominal ones, and without a limit
+    on a side where none is met."""
+    shown = {o.candidate: (o.directions != 0).any(0) for o in fitted.columns.options}
+    rest = {}
+    for c, v in fitted.setting.items():
+        met = shown.get(c, False) | np.isfinite(c.nominal)
+        values = tuple(np.where(met, v, c.nominal).tolist())
+        if not np.allclose(values, c.nominal, rtol=1e-6, atol=0):
+            rest[c] = values
+    return fitted if rest == fitted.setting else judge.fit(rest, steps=0)
 
 
 def moved_setting(columns, amounts, chosen=None):

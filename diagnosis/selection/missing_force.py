@@ -43,6 +43,8 @@ class MissingForce:
             self.force = self.force * self.weight
             sd = rms(chain.trajectory.force_sd[self.rows] * self.weight)
             self.noise = np.where(self.seen, sd, np.inf)
+            # a joint that sticks obeys no force
+            self.obeyed = np.linalg.pinv(chain.trajectory.driven[self.rows, chain.model.nv :])
             self.whole = self._pushed(self.plain)
 
     def _lacking(self, settings):
@@ -53,10 +55,8 @@ class MissingForce:
 
     def _pushed(self, plain):
         """Generalized force (n, nv) that a plain setting lacks in each row, as it is."""
-        nv = self.chain.model.nv
-        lacks = self.chain.missing(plain, self.rows)[:, nv:]
-        driven = self.chain.trajectory.driven[self.rows, nv:]
-        return np.linalg.solve(driven, lacks[..., None])[..., 0]
+        lacks = self.chain.missing(plain, self.rows)[:, self.chain.model.nv :]
+        return (self.obeyed @ lacks[..., None])[..., 0]
 
     def basis(self, start):
         """(n, nv, p): what a Start holds of the force, each row as it is; None where no row

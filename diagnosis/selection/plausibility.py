@@ -21,6 +21,7 @@ TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 #   force: what is usual in the joint           inertia: what the joint moves
 #   missing: what the nominal model lacks in the joint, over the size of what a curve is times
 #   per speed, per travel: so much force at the joint's usual speed, or travel
+#   speed: the joint's usual one                waves: one wave over its recorded range
 #   travel: the joint's recorded range          size, weight: the body's
 #   used: the largest force that the controls ask for
 TABLE = {
@@ -36,14 +37,14 @@ TABLE = {
     "stribeck_friction": [
         ("force", 0.7, 0.0, 3.0),
         ("force", 0.7, 0.0, 3.0),
-        ("plain", np.inf, 1e-4, np.inf),
+        ("speed", np.inf, 0.0, 1.0),  # what still falls beyond is another law
     ],
     "stiffness": [("per travel", 0.5, 0.0, 5.0)],
     "nonlinear_stiffness": [("per travel³", 0.5, -5.0, 5.0)],
     "spring_offset": [("force", 0.5, -2.0, 2.0)],
     "cogging": [
         ("force", 0.7, -3.0, 3.0),
-        ("plain", np.inf, 0.1, np.inf),
+        ("waves", np.inf, 1.0, np.inf),
         ("plain", np.inf, -10, 10),
     ],
     "backlash": [("travel", 0.05, 0.0, 0.3)],
@@ -70,7 +71,7 @@ TABLE = {
     "friction_map": [
         ("force", 0.7, 0.0, 3.0),
         ("plain", 0.5, 0.0, 1.0),
-        ("plain", np.inf, 0.1, np.inf),
+        ("waves", np.inf, 1.0, np.inf),
         ("plain", np.inf, -10, 10),
     ],
     "servo_stiffness": [("times", 0.25, 0.4, 2.5)],
@@ -91,6 +92,8 @@ AWAY = (
     "external_force",
     "wind",
 )
+# where the nominal value is zero and "times" says nothing
+NONE = {"servo_damping": "per speed", "contact_friction": "plain"}
 PUSH = 20.0  # times what may last: what acts for a while may be larger
 STRENGTH = 0.04  # share by which gravity's strength may differ from the model's
 
@@ -131,7 +134,7 @@ class Usual:
         measured = zip(*(windowing.states(model, r) for r in recordings))
         self.motion = motion or [np.concatenate(x) for x in measured]
         qpos, qvel = self.motion
-        gone = windowing.difference(model, np.broadcast_to(model.qpos0, qpos.shape), qpos)
+        gone = windowing.difference(model, np.broadcast_to(model.qpos_spring, qpos.shape), qpos)
         self.model, self.force, self.recordings = model, force, recordings
         self.missing, self.lacking = missing, lacking
         self.speed = np.sqrt(np.mean(qvel**2, axis=0)) + 1e-9
@@ -180,6 +183,8 @@ class Usual:
             "per travel": self.force[d] / self.travel[d],
             "per travel³": self.force[d] / self.travel[d] ** 3,
             "travel": self.range[d],
+            "speed": self.speed[d],
+            "waves": 2 * np.pi / self.range[d],
         }[kind]
 
     def _given(self, candidate):
@@ -190,13 +195,14 @@ class Usual:
         if d is None or self.lacking is None or not ActuatorEffect.servo(model, i):
             return self.unit("used", candidate)
         nominal = model.actuator_gainprm[i, 0] * self._asked(i)
+        nominal = ActuatorEffect.limited(model, i, nominal)
         gave = nominal + self.lacking[:, d] / model.actuator_gear[i, 0]
         return max(np.nanquantile(abs(gave), 0.995), 1e-9)
 
     def _times(self, curve):
         """RMS of what a curve is multiplied by."""
         kind, _, name = (curve.effect.factor or "").partition(":")
-        if kind == "speed":
+        if kind in ("speed", "damping"):
             return self.speed[self.model.joint(name).dofadr[0]]
         if kind != "control":
             return 1.0
@@ -205,7 +211,7 @@ class Usual:
     def _asked(self, i):
         """(n,) what an actuator is asked for along the motion."""
         ctrl = np.concatenate([r.ctrl for r in self.recordings])
-        return asked(self.model, i, *self.motion, ctrl)
+        return asked([self.model], i, *self.motion, ctrl)
 
 
 def plausible(candidate, usual):
@@ -218,14 +224,18 @@ def plausible(candidate, usual):
     rows = rows if len(rows) == len(parameters) else rows * len(parameters)
     scale, low, high = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
     for k, (kind, s, a, b) in enumerate(rows):
+        kind = NONE.get(candidate.effect.name, kind) if kind == "times" and not nominal[k] else kind
         ratio = kind == "times"
         unit = abs(nominal[k]) if ratio else usual.unit(kind, candidate)
+        if kind.startswith("per ") and not candidate.effect.overrides("probes"):
+            unit = max(unit, abs(nominal[k]))  # what there is may change by as much
         shift = nominal[k] if candidate.effect.name in AWAY else 0.0
         further = 1.0 if ratio else passing
         ends = np.array([a, b]) * unit * further + shift if np.isfinite(unit) else (-np.inf, np.inf)
         scale[k] = s * unit if np.isfinite(s * unit) and s * unit > 0 else np.inf
-        low[k], high[k] = max(min(ends), parameters[k].low), min(max(ends), parameters[k].high)
-        if np.isfinite(nominal[k]):
+        low[k], high[k] = np.clip([min(ends), max(ends)], parameters[k].low, parameters[k].high)
+        shape = 0 < candidate.effect.amplitudes <= k  # which nothing nominal has
+        if np.isfinite(nominal[k]) and not shape:
             low[k], high[k] = min(low[k], nominal[k]), max(high[k], nominal[k])
     return Prior(np.where(np.isfinite(nominal), nominal, 0.0), scale, low, high)
 

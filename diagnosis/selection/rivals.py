@@ -119,8 +119,9 @@ def _members(candidates, judge, before, fitted, candidate, held):
     pool = [c for c in candidates if c not in fitted.setting]
     missing, out = MissingForce(before.chain, rest, before), []
     # two geoms of one contact share its numbers, and columns tell little of them
-    twin = lambda c: (c.effect, c.nominal) == (candidate.effect, candidate.nominal)
-    twins = [c for c in _near(before.chain.world, candidate, pool) if twin(c)]
+    model = before.chain.world.model
+    twin = candidate.effect.twin(model, candidate.effect.id(model, candidate.place.name))
+    twins = [c for c in pool if (c.effect, c.place.name) == (candidate.effect, twin)]
     near = [(c, fitted.setting[candidate]) for c in twins]
     alike = _alike(judge, missing, candidate, pool, held)
     near += [(other, values) for other, values in alike if other not in twins]

@@ -152,7 +152,8 @@ def _begun(candidate, probes, prior):
     """Starts of an effect, their amplitudes as large as the machine's forces let expect."""
     n, rows = candidate.effect.amplitudes, np.array(probes, float)
     if n and len(rows) and np.isfinite(prior.scale[0]) and len(set(rows[:, 0])) == 1:
-        rows[:, :n] *= BEGUN * prior.scale[0] / rows[0, 0]
+        more = rows[:, :n] - prior.centre[:n]
+        rows[:, :n] = prior.centre[:n] + BEGUN * prior.scale[0] / more[0, 0] * more
         rows = np.clip(rows, prior.low, prior.high)
     return list(rows)
 

@@ -67,8 +67,6 @@ def dependences(world, trajectory, recordings, most=4, rows=True):
             continue
         name, d = windowing.joint_name(model, j), model.jnt_dofadr[j]
         force = trajectory.force[keep, d]
-        size = 1.4826 * np.median(abs(force)) + 1e-300
-        force = np.clip(force, -CLIP * size, CLIP * size)
         for variable, x in axes.items():
             for factor, times in _factors(model, trajectory, ctrl, j, variable).items():
                 returns = variable in (f"position:{name}", "time")
@@ -108,16 +106,17 @@ def _axes(model, trajectory, ctrl, time):
 def _factors(model, trajectory, ctrl, j, variable):
     """{factor: (rows,)} of what a curve over a variable may be multiplied by: of the joint's own
     and of time, the sign of its velocity, as friction has, its speed, as what has to be moved has,
-    and what its drives are asked for."""
+    both, as damping has, and what its drives are asked for."""
     name, out = windowing.joint_name(model, j), {None: np.ones(len(ctrl))}
     d, drives = model.jnt_dofadr[j], drives_of(model, j)
     asked_for = [f"control:{model.actuator(a).name}" for a in drives]
     if variable in ("time", f"position:{name}", *asked_for):
         out[f"velocity:{name}"] = trajectory.direction()[:, d]
         out[f"speed:{name}"] = abs(trajectory.qvel[:, d])
+        out[f"damping:{name}"] = trajectory.qvel[:, d]
     if variable in ("time", f"position:{name}", f"velocity:{name}"):
         for a in drives:
-            times = asked(model, a, trajectory.qpos, trajectory.qvel, ctrl)
+            times = asked([model], a, trajectory.qpos, trajectory.qvel, ctrl)
             out[f"control:{model.actuator(a).name}"] = times
     return out
 
@@ -135,22 +134,44 @@ def places_of(x, variable):
 
 
 def _explained(force, x, times, block, variable, wave=False):
-    """The Curve of a force over x, times a factor: linear between knots, or a wave."""
+    """The Curve of a force over x, times a factor: linear between knots, or a wave.
+
+    Where it bends, and whether, is told by the force within what is usual; how large it is, by what
+    is not there most of the time as well.
+    """
+    usual, force = _clipped(force, 1.4826 * np.median(abs(force))), _clipped(force, rms(force))
     if wave:
-        knots = _quarter(force, x, times)
+        knots = _quarter(usual, x, times)
         turn = np.pi / 2 * (x - knots[0]) / (knots[1] - knots[0])
-        sums = Sums(np.stack([np.cos(turn), np.sin(turn)], 1) * times[:, None], force, block)
-        return Curve(*sums.predicted(2), knots, sums.amounts([0, 1]))
+        basis = np.stack([np.cos(turn), np.sin(turn)], 1) * times[:, None]
+        share = Sums(basis, usual, block).predicted(2)
+        return Curve(share, rms(force) * np.sqrt(max(share, 0.0)), knots, amounts(basis, force))
     places = places_of(x, variable)
     low, span = places[0], places[-1] - places[0]
     bends = lambda at: np.maximum((at[:, None] - places[:-1]) / span, 0.0)
     shape = lambda at: np.column_stack([np.ones(len(at)), bends(np.clip(at, low, places[-1]))])
-    sums = Sums(shape(x) * times[:, None], force, block)
-    size = max(range(2, KNOTS + 1), key=lambda size: sums.predicted(size)[0])
-    chosen = sums.chosen(size)
+    basis = shape(x) * times[:, None]
+    sums = Sums(basis, usual, block)
+    size = max(range(2, KNOTS + 1), key=sums.predicted)
+    chosen, share = sums.chosen(size), sums.predicted(size)
     knots = places[[0, *sorted(k - 1 for k in chosen[2:]), -1]]
-    curve = shape(knots)[:, chosen] @ sums.amounts(chosen)
-    return Curve(*sums.predicted(size), knots, curve)
+    curve = shape(knots)[:, chosen] @ amounts(basis[:, chosen], force)
+    return Curve(share, rms(force) * np.sqrt(max(share, 0.0)), knots, curve)
+
+
+def _clipped(force, size):
+    """A force of which no row is larger than CLIP sizes."""
+    return np.clip(force, -CLIP * size - 1e-300, CLIP * size + 1e-300)
+
+
+def amounts(basis, force):
+    """(k,) of a basis (n, k) that fit a force (n,)."""
+    return _solved((basis.T @ basis)[None], (basis.T @ force)[None, :, None])[0, :, 0]
+
+
+def rms(x):
+    """Of (n,)."""
+    return np.sqrt(np.mean(x**2))
 
 
 class Sums:
@@ -161,7 +182,7 @@ class Sums:
         parts = [slice(*np.searchsorted(block, [b, b + 1])) for b in range(block.max() + 1)]
         self.gram = np.array([basis[p].T @ basis[p] for p in parts])
         self.score = np.array([basis[p].T @ force[p] for p in parts])
-        self.square, self.number = np.sum(force**2), len(force)
+        self.square = np.sum(force**2)
         others = self.gram.sum(0) - self.gram, self.score.sum(0) - self.score
         self.without = self._taken(*others, min(KNOTS, basis.shape[1]))
         self.left = [self._left(*others, some) for some in self.without]
@@ -190,22 +211,16 @@ class Sums:
         return self.square - 2 * cross + np.einsum("bi,bij,bj->", z, _among(self.gram, some), z)
 
     def predicted(self, size):
-        """(share of the force's variance that so many columns predict in each block, chosen and
-        fitted without it, RMS of that)."""
+        """Share of the force's variance that so many columns predict in each block, chosen and
+        fitted without it."""
         left = self.left[min(size, len(self.left) + 1) - 2]
-        share = float(1 - left / self.square) if self.square > 0 else 0.0
-        return share, float(np.sqrt(max(share, 0.0) * self.square / max(self.number, 1)))
+        return float(1 - left / self.square) if self.square > 0 else 0.0
 
     def chosen(self, size):
         """So many columns, or fewer where no more explain anything."""
         gram, score = self.gram.sum(0)[None], self.score.sum(0)[None]
         *_, some = self._taken(gram, score, min(size, gram.shape[-1]))
         return [0, 1, *(int(k) for k in some[0, 2:] if k > 1)]
-
-    def amounts(self, some):
-        """(p,) of columns some (p,) that fit the force."""
-        gram, score = self.gram.sum(0)[np.ix_(some, some)], self.score.sum(0)[some]
-        return _solved(gram[None], score[None, :, None])[0, :, 0]
 
 
 def _among(gram, some):

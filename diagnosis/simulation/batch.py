@@ -140,7 +140,7 @@ class Engine:
         batch.state[:n] = self.rest
         batch.bind("qpos")[:n], batch.bind("qvel")[:n] = qpos, qvel
         if self.model.na:
-            driven = np.array([self.working.activation(r, t) for r, t in zip(recordings, begin)])
+            driven = self._activations(recordings, begin, on)
             act = np.where(self.hidden, 0.0 if act is None else act, driven)
             batch.bind("act")[:n] = act
         # sensordata belongs to the state before a step, so sensors need one step more
@@ -166,6 +166,15 @@ class Engine:
         else:
             act = np.zeros((n, 1 + count, self.model.na))
         return q, v, out.get("sensordata"), act
+
+    def _activations(self, recordings, begin, drives):
+        """Activations (n, na) of the working model at times begin (n,)."""
+        out, alike = np.empty((len(begin), self.model.na)), {}
+        for s, (recording, drive) in enumerate(zip(recordings, drives)):
+            alike.setdefault((recording, drive.changed), []).append(s)
+        for (recording, changed), some in alike.items():
+            out[some] = self.working.activation(recording, begin[some], changed)
+        return out
 
     def _batch(self, n, stepwise):
         """A Batch of n simulations, or more of those that run in one call, which is kept."""

@@ -107,6 +107,16 @@ class Signal:
         i = self._row(t)
         return area[i] + self.value[i] * (t - self.time[i])
 
+    def held(self, t, low, high):
+        """As integral(), kept between low and high at all times: what an activation adds up to."""
+        if np.isinf([low, high]).all():
+            return self.integral(t)
+        area = [min(max(0.0, low), high)]
+        for gained in (self.value[:-1] * np.diff(self.time)).tolist():
+            area.append(min(max(area[-1] + gained, low), high))
+        i = self._row(t)
+        return np.clip(np.array(area)[i] + self.value[i] * (t - self.time[i]), low, high)
+
     def filtered(self, t):
         """The lag's output at times t of the undelayed control, exactly."""
         # act[i+1] = decay[i] act[i] + (1 - decay[i]) value[i], as a scan that doubles its reach

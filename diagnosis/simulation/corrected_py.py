@@ -54,8 +54,27 @@ def python_parts(model, setting, written=None):
             i = candidate.effect.id(model, candidate.place.name)
             part = candidate.effect.part(model, i, values)
             parts += [part] if isinstance(part, Part) else list(part or ())
+    moved = {
+        c.place.name: values[0]
+        for c, values in setting.items()
+        if c.effect.name == "sensor_bias" and (written or {}).get(c) == "mjcf"
+    }
     late = {"delay": 1, "lag": 2}  # of what the others leave
+    parts = [_as_read(part, moved) for part in parts]
     return sorted(parts, key=lambda part: late.get(part.law, 0))
+
+
+def _as_read(part, moved):
+    """A Part over the true position of a joint, over that which corrected.xml has where a sensor's
+    bias {joint: offset} is written: it reads so much more."""
+    numbers = dict(part.numbers)
+    of = numbers.get("of", f"position:{part.place}")
+    by = moved.get(of.removeprefix("position:"), 0.0) if of.startswith("position:") else 0.0
+    if by and "phase" in numbers:
+        numbers["phase"] -= numbers["waves"] * by
+    if by and "knots" in numbers:
+        numbers["knots"] = [x + by for x in numbers["knots"]]
+    return part._replace(numbers=numbers)
 
 
 def corrected_py(parts, joints, xml_name="corrected.xml"):

@@ -93,10 +93,11 @@ def drives(model, joint):
     return [(model.actuator(a).name, model.actuator_gear[a, 0]) for a in np.flatnonzero(own)]
 
 
-def drive(look, joint):
-    """Force of the joint's drives in its own coordinate, within the joint's range for them."""
+def drive(look, joint, more=0.0):
+    """Force of the joint's drives in its own coordinate and some more of theirs, within the joint's
+    range for them."""
     model, j = look.model, joint_id(look.model, joint)
-    total = sum(gear * look.force(name) for name, gear in drives(model, joint))
+    total = more + sum(gear * look.force(name) for name, gear in drives(model, joint))
     return np.clip(total, *model.jnt_actfrcrange[j]) if model.jnt_actfrclimited[j] else total
 
 
@@ -154,13 +155,15 @@ def asked(look, actuator):
 
 
 def factor_of(look, factor):
-    """What a curve is multiplied by: 1, what an actuator is asked for, a speed, or its sign."""
+    """What a curve is multiplied by: 1, what an actuator is asked for, a velocity, its size or its
+    sign."""
     if factor is None:
         return 1.0
     kind, _, place = factor.partition(":")
     if kind == "control":
         return asked(look, place)
-    return (abs if kind == "speed" else np.sign)(look.velocity(place))
+    velocity = look.velocity(place)
+    return {"velocity": np.sign(velocity), "speed": abs(velocity), "damping": velocity}[kind]
 
 
 def curve(look, joint, of, knots, forces, factor=None):
@@ -286,9 +289,10 @@ def corrections(model, look):
     for law, place, numbers in PARTS:
         if law in DRIVE:
             a = actuator_id(model, place)
-            dof = model.jnt_dofadr[model.actuator_trnid[a, 0]]
-            gear = model.actuator_gear[a, 0]
-            force.append((dof, gear * DRIVE[law](look, place, **numbers)))
+            joint = model.joint(model.actuator_trnid[a, 0])
+            lost = model.actuator_gear[a, 0] * DRIVE[law](look, place, **numbers)
+            lost = drive(look, joint.name, lost) - drive(look, joint.name)
+            force.append((joint.dofadr[0], lost))
         elif law in FORCE:
             dof = model.jnt_dofadr[joint_id(model, place)]
             force.append((dof, FORCE[law](look, place, **numbers)))

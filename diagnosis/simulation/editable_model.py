@@ -21,13 +21,14 @@ FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
 class Drive(NamedTuple):
     """What a simulation runs on: ctrl (count, nu), qfrc (nv,), xfrc (nbody, 6); model None if
-    MuJoCo refused it."""
+    MuJoCo refused it; changed: see Working.changed()."""
 
     model: mujoco.MjModel
     ctrl: np.ndarray
     qfrc: np.ndarray
     xfrc: np.ndarray
     items: list
+    changed: tuple
 
 
 class Working:
@@ -103,75 +104,77 @@ class Working:
         one call share."""
         key = id(items)
         if key not in memo:
-            changed, qfrc, xfrc = {}, np.zeros(self.model.nv), np.zeros((self.model.nbody, 6))
+            qfrc, xfrc = np.zeros(self.model.nv), np.zeros((self.model.nbody, 6))
             for candidate, values in items:
-                if candidate.effect.overrides("command"):
-                    changed.setdefault(candidate.place.name, []).append((candidate.effect, values))
                 i = candidate.effect.id(self.model, candidate.place.name)
                 candidate.effect.push(qfrc, xfrc, self.model, i, values)
-            changed = tuple((name, tuple(effects)) for name, effects in changed.items())
-            memo[key] = self.edited(items, step), qfrc, xfrc, changed
+            memo[key] = self.edited(items, step), qfrc, xfrc, self.changed(items)
         model, qfrc, xfrc, changed = memo[key]
-        return Drive(model, self.control(recording, start, step, count, changed), qfrc, xfrc, items)
+        ctrl = self.control(recording, start, step, count, changed)
+        return Drive(model, ctrl, qfrc, xfrc, items, changed)
+
+    @staticmethod
+    def changed(items):
+        """((actuator, ((effect, values), ...)), ...): the effects of items on the way of the
+        controls to the actuators."""
+        found = {}
+        for candidate, values in items:
+            if candidate.effect.overrides("command"):
+                found.setdefault(candidate.place.name, []).append((candidate.effect, values))
+        return tuple((name, tuple(effects)) for name, effects in found.items())
 
     def control(self, recording, start, step, count, changed=()):
         """What the actuators see in `count` steps from time `start`, (count, nu), kept for the
-        next call.
-
-        changed: ((actuator, ((effect, values), ...)), ...), the effects on the way to them.
-        """
+        next call; changed: see changed()."""
         key = recording, start, step, count, changed
         if key in self.controls:
             self.controls.move_to_end(key)
             return self.controls[key]
         m, average = self.nominal, runge_kutta(self.nominal)
-        if changed:
-            ctrl = self.control(recording, start, step, count).copy()
-            for name, effects in changed:
-                a = m.actuator(name).id
-                u = m.actuator_ctrladr[a]
-                signal = self.signal(recording, a, u)
-                for effect, values in effects:
-                    signal = effect.command(signal, m, a, values)
+        ctrl = self.control(recording, start, step, count).copy() if changed else None
+        ctrl = np.zeros((count, m.nu)) if ctrl is None else ctrl
+        some = [m.actuator(name).id for name, _ in changed] if changed else range(m.nactuator)
+        for a in some:
+            for u in range(m.actuator_ctrladr[a], m.actuator_ctrladr[a] + m.actuator_ctrlnum[a]):
+                signal = self.signal(recording, a, u, changed)
                 ctrl[:, u] = signal.sample(start, step, count, average)
-        else:
-            ctrl = np.zeros((count, m.nu))
-            for a in range(m.nactuator):
-                for u in range(
-                    m.actuator_ctrladr[a], m.actuator_ctrladr[a] + m.actuator_ctrlnum[a]
-                ):
-                    ctrl[:, u] = self.signal(recording, a, u).sample(start, step, count, average)
         self.controls[key] = ctrl
         self.control_bytes += ctrl.nbytes
         while self.control_bytes > COPY_BYTES and len(self.controls) > 1:
             self.control_bytes -= self.controls.popitem(last=False)[1].nbytes
         return ctrl
 
-    def signal(self, recording, a, u):
-        """The nominal Signal of control u of actuator a."""
+    def signal(self, recording, a, u, changed=()):
+        """The Signal of control u of actuator a, the nominal one or as effects change it."""
         value, m = recording.ctrl[:, u], self.nominal
         if m.actuator_ctrllimited[u]:
             value = np.clip(value, *m.actuator_ctrlrange[u])
-        return Signal(recording.time, value, nominal_delay(m, a))
+        signal = Signal(recording.time, value, nominal_delay(m, a))
+        for name, effects in changed:
+            for effect, values in effects if name == m.actuator(a).name else ():
+                signal = effect.command(signal, m, a, values)
+        return signal
 
-    def activation(self, recording, start):
-        """Activations (na,) at time `start`, run on from the recorded control."""
-        act, m = np.zeros(self.model.na), self.model
+    def activation(self, recording, start, changed=()):
+        """Activations (n, na) at times `start` (n,), run on from the recorded control, as effects
+        change it."""
+        m, start = self.model, np.asarray(start, float)
+        act = np.zeros((len(start), m.na))
         for a in np.flatnonzero(self.nominal.actuator_ctrlnum):
             i, kind = m.actuator_actadr[a], m.actuator_dyntype[a]
-            signal = self.signal(recording, a, self.nominal.actuator_ctrladr[a])
-            t = np.array([start - signal.delay])
-            if i >= 0 and kind in FILTERS:
-                act[i] = Signal(
-                    signal.time, signal.value, lag=max(m.actuator_dynprm[a, 0], 1e-10)
-                ).filtered(t)[0]
-            elif i >= 0 and kind == int(
-                mujoco.mjtDyn.mjDYN_INTEGRATOR
-            ):  # from zero at the first row
-                limits = m.actuator_actrange[a] if m.actuator_actlimited[a] else (-np.inf, np.inf)
-                act[i] = np.clip(signal.integral(np.maximum(t, signal.time[0]))[0], *limits)
-            elif i >= 0 and kind == MUSCLE:
-                act[i] = np.interp(t, *self._muscle(recording, a))[0]
+            if i < 0:
+                continue
+            signal = self.signal(recording, a, self.nominal.actuator_ctrladr[a], changed)
+            t = start - signal.delay
+            if kind in FILTERS:
+                lag = max(m.actuator_dynprm[a, 0], 1e-10)
+                act[:, i] = Signal(signal.time, signal.value, lag=lag).filtered(t)
+            elif kind == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # from zero at the first row
+                limited = m.actuator_actlimited[a]
+                limits = m.actuator_actrange[a] if limited else (-np.inf, np.inf)
+                act[:, i] = signal.held(np.maximum(t, signal.time[0]), *limits)
+            elif kind == MUSCLE:
+                act[:, i] = np.interp(t, *self._muscle(recording, a))
         return act
 
     def _muscle(self, recording, a):

@@ -15,6 +15,7 @@ from diagnosis.simulation.control_signal import SLACK
 from diagnosis.simulation.simulator import Case
 
 INPUT = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+BODIES = int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
 CHUNK = 40000  # simulations in memory at a time
 STEPS = 2  # coarse ones in a row
 SWING = 0.3  # rad of phase, or share of the decay, of the fastest joint's motion in a coarse step
@@ -77,7 +78,11 @@ class RowMap:
         model = self.working.edited(case.on, case.step)
         if model is None:
             raise ValueError("MuJoCo refuses these values")
-        self.model = model
+        self.model, self.bias = model, (None, None, None)
+        self.constant, self.xfrc = np.zeros(model.nv), np.zeros((model.nbody, 6))
+        for c, values in case.on:
+            i = c.effect.id(model, c.place.name)
+            c.effect.push(self.constant, self.xfrc, model, i, values)
         time = [r.time for r in recordings]
         first = np.cumsum([0] + [len(t) for t in time])
         self.begin = np.concatenate(
@@ -104,6 +109,7 @@ class RowMap:
     def _controls(self, recording):
         """(rows - 1, count, nu): what the actuators see in the steps after each row."""
         model, average = self.nominal, runge_kutta(self.nominal)
+        changed = self.working.changed(self.case.on)
         start, out = (
             recording.time[:-1, None],
             np.zeros((len(recording.time) - 1, self.count, model.nu)),
@@ -111,19 +117,16 @@ class RowMap:
         for a in range(model.nactuator):
             u = model.actuator_ctrladr[a]
             for k in range(u, u + model.actuator_ctrlnum[a]):
-                signal = self.working.signal(recording, a, k)
-                for c, values in self.case.on:
-                    if c.place.kind == "actuator" and c.place.name == model.actuator(a).name:
-                        signal = c.effect.command(signal, model, a, values)
+                signal = self.working.signal(recording, a, k, changed)
                 out[:, :, k] = signal.sample(start, self.case.step, self.count, average)
         return out
 
     def _activations(self):
         if not self.model.na:
             return np.zeros((len(self.begin), 0))
-        return np.array(
-            [self.working.activation(r, t) for r in self.recordings for t in r.time[:-1]]
-        )
+        changed = self.working.changed(self.case.on)
+        each = [self.working.activation(r, r.time[:-1], changed) for r in self.recordings]
+        return np.concatenate(each)
 
     def ahead(self, index, qpos, qvel, force):
         """States after rows begin[index], index (n,), from states (n, nq), (n, nv) under force
@@ -154,14 +157,16 @@ class RowMap:
         m, n = self.model, len(index)
         state = np.concatenate([np.zeros((n, 1)), qpos, qvel, self.activation[index]], 1)
         control = self.control[index, :count]
-        control = np.concatenate([control, np.repeat(force[:, None], count, 1)], 2)
+        given = [np.repeat(force[:, None], count, 1)]
+        given += [np.tile(self.xfrc.ravel(), (n, count, 1))] if self.xfrc.any() else []
+        control = np.concatenate([control, *given], 2)
         number = threads() or 2
         path, _ = rollout.rollout(
             m,
             [mujoco.MjData(m) for _ in range(number)],
             state,
             control,
-            control_spec=INPUT,
+            control_spec=INPUT | BODIES * bool(self.xfrc.any()),
             nstep=count,
         )
         path = np.concatenate([state[:, None], path], 1)
@@ -188,20 +193,14 @@ class RowMap:
         return some, (qpos, qvel, self.control[index, 0], time)
 
     def forces(self, index, qpos, qvel):
-        """(n, nv): forces of the setting's effects that depend on the state, as at the row's
-        beginning."""
-        out, xfrc = np.zeros((len(index), self.model.nv)), np.zeros((self.model.nbody, 6))
-        constant = np.zeros(self.model.nv)
-        for c, values in self.case.on:
-            i = c.effect.id(self.model, c.place.name)
-            c.effect.push(constant, xfrc, self.model, i, values)
+        """(n, nv): forces in the joints of the setting's effects, as at the row's beginning."""
+        out = np.tile(self.constant, (len(index), 1))
         some, state = self._stepwise(index, qpos, qvel)
         for effect, i, models, values in some:
             function = effect.force(models, i, values)
             if function is not None:
                 out += function(*state)
-        out += constant
-        return out + self._pushed(xfrc, qpos) if xfrc.any() else out
+        return out
 
     def limits(self, index, qpos, qvel):
         """(n, nv): dry friction that the setting's effects add at most, as at the row's beginning;
@@ -218,26 +217,17 @@ class RowMap:
         return np.maximum(out, 0.0)
 
     def _bias(self, qpos, qvel):
-        """(n, nv): qfrc_bias at states."""
+        """(n, nv): qfrc_bias at states, kept for the next call: derivatives by force ask again."""
+        before, after, out = self.bias
+        if np.array_equal(before, qpos) and np.array_equal(after, qvel):
+            return out
         data, out = mujoco.MjData(self.model), np.zeros((len(qpos), self.model.nv))
         for row, q, v in zip(out, qpos, qvel):
             data.qpos[:], data.qvel[:] = q, v
             mujoco.mj_fwdPosition(self.model, data)
             mujoco.mj_fwdVelocity(self.model, data)
             row[:] = data.qfrc_bias
-        return out
-
-    def _pushed(self, xfrc, qpos):
-        """(n, nv): constant forces on bodies as forces in the joints."""
-        data, out = mujoco.MjData(self.model), np.zeros((len(qpos), self.model.nv))
-        for row, q in zip(out, qpos):
-            data.qpos[:] = q
-            mujoco.mj_kinematics(self.model, data)
-            mujoco.mj_comPos(self.model, data)
-            for body in np.flatnonzero(xfrc.any(1)):
-                mujoco.mj_applyFT(
-                    self.model, data, xfrc[body, :3], xfrc[body, 3:], data.xipos[body], body, row
-                )
+        self.bias = qpos, qvel, out
         return out
 
     def linearised(self, qpos, qvel, force, scale, skipped):
@@ -264,24 +254,20 @@ class RowMap:
         n, nv = len(index), self.model.nv
         q, v = self.ahead(index, qpos, qvel, force)
         A, B = np.empty((n, 2 * nv, 2 * nv)), np.empty((n, 2 * nv, nv))
-        for d in range(nv):
-            unit = np.zeros(nv)
-            unit[d] = 1.0
-            for block, k, eps in (
-                (A, d, SMALL[0]),
-                (A, nv + d, SMALL[1]),
-                (B, d, SMALL[2] * scale[d]),
-            ):
-                moved = [qpos, qvel, force]
-                which = 2 if block is B else int(k >= nv)
-                moved[which] = (
-                    integrate(self.nominal, qpos, np.tile(eps * unit, (n, 1)))
-                    if which == 0
-                    else moved[which] + eps * unit
-                )
-                q1, v1 = self.ahead(index, *moved)
-                block[:, :nv, k] = difference(self.nominal, q, q1) / eps
-                block[:, nv:, k] = (v1 - v) / eps
+        # by forces first: these leave the load as it is
+        columns = [(B, d, SMALL[2] * scale[d]) for d in range(nv)]
+        columns += [(A, k, SMALL[k // nv]) for k in range(2 * nv)]
+        for block, k, eps in columns:
+            moved, step = [qpos, qvel, force], eps * np.eye(nv)[k % nv]
+            which = 2 if block is B else k // nv
+            moved[which] = (
+                integrate(self.nominal, qpos, np.tile(step, (n, 1)))
+                if which == 0
+                else moved[which] + step
+            )
+            q1, v1 = self.ahead(index, *moved)
+            block[:, :nv, k] = difference(self.nominal, q, q1) / eps
+            block[:, nv:, k] = (v1 - v) / eps
         return q, v, A, B
 
 

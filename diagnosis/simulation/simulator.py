@@ -132,21 +132,14 @@ class World:
             self.model, candidate.effect.id(self.model, candidate.place.name), recordings
         )
 
-    def suited(self, candidate, recordings):
-        """The candidate with steps and bounds that suit the recorded motion."""
-        i = candidate.effect.id(self.model, candidate.place.name)
-        return replace(
-            candidate,
-            parameters=candidate.effect.suited(candidate.parameters, self.model, i, recordings),
-        )
-
     def joints(self, place):
         """Ids of the joints a place belongs to, or None for all."""
         m = self.model
         if place.kind == "joint":  # or two of them, "a+b"
             return set(joints_of(m, place.name))
         if place.kind == "body":
-            return {j for j in range(m.njnt) if m.jnt_bodyid[j] == m.body(place.name).id}
+            moved = m.body_weldid[m.jnt_bodyid] == m.body_weldid[m.body(place.name).id]
+            return set(np.flatnonzero(moved).tolist())
         if place.kind == "actuator" and m.actuator_trntype[m.actuator(place.name).id] == int(
             mujoco.mjtTrn.mjTRN_JOINT
         ):

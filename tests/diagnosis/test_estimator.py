@@ -126,6 +126,7 @@ class Search:
 
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train, self.say, self.log = world, train, say, log or (lambda line: None)
+        self.smoother = SimpleNamespace(locate=lambda setting, near, passes: (dict(setting), near))
 
     def run(self, setting):
         self.begun_with = setting
@@ -167,6 +168,7 @@ def test_what_lasts_is_searched_again_where_an_event_is_not(monkeypatch, beside,
     assert told is event and ended.fitted.setting == {"friction": friction}
     if event:
         assert (search.world, search.train) == ("world", "calm")
+        assert ended.trajectory == (ended.fitted.setting, None)  # under what it ended with
         assert search.begun_with == {"friction": 0.1}  # begun at nothing it may end anywhere
     else:
         assert search is whole and ended is found

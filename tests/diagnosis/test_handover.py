@@ -1,5 +1,6 @@
 """Nothing is handed over that predicts kept-back recordings worse, or that they do not need."""
 
+from copy import copy
 from types import SimpleNamespace
 
 import mujoco
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 from plants import DRIVEN_PENDULUM, NOISE, recorded
 
-from diagnosis.estimation import prediction_error
+from diagnosis.estimation import prediction_error, windowing
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.handover import Check, Files, accepted
 from diagnosis.simulation.simulator import World
@@ -110,7 +111,7 @@ def test_one_window_decides_nothing_about_a_finding(kept_back, harm, kept):
     harm = np.array([harm, harm])
     none = np.zeros(harm.shape)
 
-    def squares(files, setting):
+    def squares(files, setting, near=False):
         """Of the first of two findings the second one makes worse by the harm."""
         return 30.0 - 20 * (some[0] in setting) + (harm if some[1] in setting else none)
 
@@ -126,3 +127,21 @@ def test_noise_makes_predictions_better_or_worse_by_its_mean_square():
     rows = sum(w.last - w.first for w in check.windows)
     drawn = np.random.default_rng(0).normal(size=(2000, rows))
     assert check.scattered() == pytest.approx(2 * np.std((drawn**2).mean(1)), rel=0.1)
+
+
+def test_windows_begin_at_the_motion_of_their_own_setting_whatever_was_asked_before():
+    """Of an arm of another mass, not along transitions of the nominal one."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    runs = [recorded("held.csv", 7, mass=0.8)]
+    smoother = Smoother(world, runs)
+    smoother.locate({}, passes=1)
+    heavier = {world.candidate("mass", "arm"): (0.8,)}
+
+    def begun(before):
+        check = Check(world, runs, copy(smoother), smoother.position_noise)
+        if before:
+            check.squares(Files.of(world, {}), {})
+        return np.hstack(windowing.recorded_starts(world.model, check.smoothed(heavier)))
+
+    # rad and rad/s; along the other transitions it would be ten times as much
+    assert abs(begun(True) - begun(False)).max() < 3e-3

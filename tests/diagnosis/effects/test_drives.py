@@ -6,8 +6,22 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from plants import PENDULUM, SIZES, START, arm, commanded, pendulum, record, simulate, stock
+from plants import (
+    PENDULUM,
+    SIZES,
+    START,
+    WEAKER,
+    arm,
+    commanded,
+    pendulum,
+    record,
+    simulate,
+    stepped,
+    stock,
+    tight,
+)
 
+from diagnosis.effects.actuators import ActuatorEffect
 from diagnosis.effects.friction import FrictionCurve, friction_curve
 from diagnosis.simulation.control_signal import Signal
 from diagnosis.simulation.rows import RowMap
@@ -333,6 +347,21 @@ def test_what_a_drive_cannot_give(effect):
     assert abs(run(world, {}, recording, 0.0, 0.0) - expected).max() > 0.05
 
 
+@pytest.mark.parametrize("effect", WEAKER)
+def test_a_drive_that_fades_stays_within_the_joints_range(effect):
+    """What its joint passes on is the weaker force, cut; not the force that was cut, weakened."""
+    world, (values, weaker) = tight(), WEAKER[effect]
+    candidate = world.candidate(effect, "m")
+    q, v, t = np.random.default_rng(0).uniform([[-1], [-4], [0]], [[1], [4], [0.5]], (3, 200))
+    goal = np.full((200, 1), 0.5)
+    given = [world.model] * 200, candidate.effect.id(world.model, "m"), np.tile(values, (200, 1))
+    added = candidate.effect.force(*given)(q[:, None], v[:, None], goal, t)[:, 0]
+    whole = 50 * (0.5 - q)
+    cut = np.clip(weaker(whole, v, t), -1, 1)
+    np.testing.assert_allclose(added + np.clip(whole, -1, 1), cut, atol=1e-12)
+    assert (abs(cut) < 0.9).any() and (abs(cut) == 1).any()
+
+
 def test_a_limit_above_the_recorded_pace_is_begun_too():
     """A control is held until the next one: a limit turns its step into a ramp, however slowly the
     controls change from row to row."""
@@ -343,6 +372,36 @@ def test_a_limit_above_the_recorded_pace_is_begun_too():
     assert fastest > pace.max()
     change = run(world, {limit: fastest}, recording, 0.0, 0.0) - run(world, {}, recording, 0.0, 0.0)
     assert abs(change).max() > 1e-3
+
+
+def test_a_servo_that_is_asked_for_steps_is_begun_at_the_pace_at_which_it_moves():
+    """Steps of 1.5 rad from one row to the next have a pace of 150 rad/s."""
+    world, recording = stepped()
+    probes = world.probes(world.candidate("rate_limit", "m"), [recording])
+    assert ((probes > 1.5) & (probes < 3)).any()
+
+
+def test_a_limit_of_force_is_begun_on_either_side_of_the_models():
+    """A servo that asks for 1500 N·m and may give 50."""
+    world, recording = stepped()
+    limit = world.candidate("saturation", "m")
+    assert limit.nominal == (50.0,)
+    probes = world.probes(limit, [recording])[:, 0]
+    below, above = probes[probes < 50], probes[probes > 50]
+    assert len(below) >= 5 and below.min() < 5 and 0 < len(above) and above.max() < 200
+
+
+def test_a_drive_gave_no_more_than_its_joint_passes_on():
+    """50 N·m one way and 30 the other, through a gear that turns it round."""
+    world, run = stepped()
+    spec = world.spec.copy()
+    spec.actuator("m").gear[0] = -2
+    spec.joint("j").actfrcrange, spec.joint("j").actfrclimited = (-30, 50), True
+    model, asked = spec.compile(), np.array([-100.0, -26.0, -24.0, 14.0, 16.0, 100.0])
+    np.testing.assert_array_equal(
+        ActuatorEffect.limited(model, 0, asked), [-25.0, -25.0, -24.0, 14.0, 15.0, 15.0]
+    )
+    assert ActuatorEffect.forces(model, 0, [run]).max() == 15.0  # it is asked upwards alone
 
 
 def test_a_motor_that_tires_with_its_effort():

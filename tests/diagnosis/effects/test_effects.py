@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import MODELS, SIZES, START, T, arm, commanded, pendulum, record, simulate, stock
+from plants import MODELS, SIZES, START, arm, commanded, pendulum, record, simulate, stock
 
 from diagnosis.effects import EFFECTS
 from diagnosis.effects.unmodelled import asked, holds
@@ -357,9 +357,21 @@ def test_what_actuators_are_asked_is_their_force_over_their_gain():
             model.actuator_forcelimited[:] = 0
             mujoco.mj_forward(model, data)
             for a in range(model.nu):
-                assert asked(model, a, data.qpos, data.qvel, data.ctrl) * model.actuator_gainprm[
+                assert asked([model], a, data.qpos, data.qvel, data.ctrl) * model.actuator_gainprm[
                     a, 0
                 ] == pytest.approx(data.actuator_force[a])
+
+
+def test_a_curve_times_what_a_servo_is_asked_for_is_the_same_beside_other_settings():
+    """What it is asked for follows from the bias of its own setting."""
+    world, _ = arm("servos")
+    curve = world.curve("elbow", "time", (0.1, 0.3), "control:bend")
+    bias, recording = world.candidate("bias", "bend"), record(world)
+    settings = [{curve: (0.1, -0.2), **more} for more in ({}, {bias: (3.0,)}, {bias: (-1.0,)})]
+    together = simulate(world, settings, recording)
+    for setting, qpos in zip(settings, together):
+        np.testing.assert_array_equal(simulate(world, [setting], recording)[0], qpos)
+    assert abs(together[1] - together[0]).max() > 0.01
 
 
 def test_probes_show_something(case):
@@ -368,53 +380,11 @@ def test_probes_show_something(case):
     recording = replace(recording, qpos=simulate(world, [{}], recording)[0])
     for candidate in world.candidates:
         rows = np.array([*world.probes(candidate, [recording]), *world.far(candidate, [recording])])
-        suited = world.suited(candidate, [recording]).parameters
-        low, high = (np.array([getattr(p, bound) for p in suited]) for bound in ("low", "high"))
+        bounds = [(p.low, p.high) for p in candidate.parameters]
+        low, high = np.array(bounds).T
         assert rows.ndim == 2 and rows.shape[1] == len(low) and len(rows), candidate
         assert (((rows >= low) & (rows <= high)) | np.isinf(rows)).all(), candidate
         assert not (rows == candidate.nominal).all(axis=1).any()
-
-
-def test_stribeck_friction_has_fallen_at_the_speeds_that_are_reached():
-    world, _ = arm("motors")
-    run = replace(
-        record(world),
-        qpos=np.cumsum(np.random.default_rng(0).uniform(0, 0.02, (T, world.model.nq)), 0),
-    )  # at up to 2 rad/s
-    candidate = world.candidate("stribeck_friction", "elbow")
-    velocity = world.suited(candidate, [run]).parameters[2]
-    assert 0.5 < velocity.high < 1.5 and velocity.low < velocity.nominal <= velocity.high
-    assert all(row[2] <= velocity.high for row in world.probes(candidate, [run]))
-
-
-def test_a_friction_map_turns_once_within_the_travel_at_least():
-    world, _ = arm("motors")
-    candidate = world.candidate("friction_map", "elbow")
-    run = record(world)
-    swept = replace(run, qpos=np.linspace(-1.0, 1.0, T)[:, None] * np.ones(world.model.nq))
-    waves = world.suited(candidate, [swept]).parameters[2]
-    assert 2 * np.pi / waves.low == pytest.approx(0.96 * 2.0, rel=0.01)  # but for rare ends
-    assert min(row[2] for row in world.probes(candidate, [swept])) >= waves.low
-
-
-@given(st.floats(0.01, 30), st.floats(0.01, 30))
-def test_small_steps_are_forces_of_one_size_whatever_the_motion(reach, speed):
-    """k·x³ and d·v² at the farthest and fastest row, against the steps of a motion of size one."""
-    world = World(
-        mujoco.MjSpec.from_string("""<mujoco><worldbody><body><joint name="x" type="slide"/>
-            <geom size=".1"/></body>
-                                            </worldbody></mujoco>""")
-    )
-    there_and_back = reach * np.array([0.0, 1.0, 0.0, -1.0] * 50)
-    time = reach / speed * np.arange(len(there_and_back))
-    recording = SimpleNamespace(qpos=there_and_back[:, None], time=time)
-    for effect, size in (("nonlinear_stiffness", reach**2), ("quadratic_damping", speed)):
-        candidate = world.candidate(effect, "x")
-        [usual], [suited] = candidate.parameters, world.suited(candidate, [recording]).parameters
-        assert suited.step * size == pytest.approx(usual.step, rel=1e-6)
-        assert (
-            suited.low <= usual.low <= suited.nominal == usual.nominal < usual.high <= suited.high
-        )
 
 
 ROD = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="x" axis="0 1 0"

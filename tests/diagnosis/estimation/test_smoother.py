@@ -1,16 +1,18 @@
 """The located force against hidden ones that were put into stock MuJoCo, and against none."""
 
 from copy import copy
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
-from plants import DRIVEN_PENDULUM, recorded
+from plants import DRIVEN_PENDULUM, on_spring, recorded
 
 from diagnosis.estimation import windowing
 from diagnosis.estimation.smoother import BLOCK, LOUDER, Smoother
 from diagnosis.recordings.recording import Recording
+from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.rows import RowMap
 from diagnosis.simulation.simulator import World
 
@@ -244,3 +246,30 @@ def test_blocks_that_are_smoothed_apart_join_without_a_jump(name):
     edge = (begin + 1) % BLOCK == 0
     usual = np.sqrt(np.mean(found.qvel_sd**2, 0))
     assert edge.any() and (abs(jump[edge]) < 0.1 * usual).all()
+
+
+def test_what_springs_hold_counts_among_usual_forces():
+    """An undriven wheel at 5 Hz: turning it round in 0.2 s would take a seventh of its spring."""
+    world, run = on_spring(stiff=100.0)
+    smoother = Smoother(world, [run])
+    assert smoother.scale[0] > np.mean(abs(100 * run.qpos))
+    spring = world.candidate("stiffness", "j")
+    assert plausible(spring, Usual(world, [run], smoother.scale)).inside([110.0])
+
+
+def test_a_joint_that_a_brake_holds_stays_where_it_is():
+    """Its readings never change, and the model has no brake."""
+    joint = '<joint name="k" axis="0 1 0" damping="0.05"/>'
+    held = ARM.replace(joint, "").replace('pos="0 0 -.3">', 'pos="0 0 -.3" euler="0 28.64789 0">')
+    held = held.replace('<motor name="n" joint="k"/>', "")
+    run, _ = moved(held, 0)
+    other = np.full((len(run.time), 1), 0.5)
+    run = replace(
+        run,
+        qpos=np.hstack([run.qpos, other]),
+        qvel=np.full((len(run.time), 2), np.nan),
+        ctrl=np.hstack([run.ctrl, 0 * other]),
+    )
+    found = Smoother(World(mujoco.MjSpec.from_string(ARM)), [run]).locate({})
+    assert abs(found.qpos[:, 1] - 0.5).max() < 1e-3
+    assert abs(found.force[5:-5, 1]).mean() > 0.1  # what the brake holds

@@ -137,3 +137,17 @@ def test_a_step_that_would_leave_its_bounds_goes_the_other_way(scene):
         [start] = Starts(world, {step: (h,)}, usual).of([step])
         prior = plausible(step, usual)
         assert prior.inside(start.base + start.directions[0]) and start.directions[0, 0] != 0
+
+
+def test_a_limit_that_the_model_lacks_is_begun_at_whole_values_alone(scene):
+    """No share of the way to it means anything, so no column is asked for anew."""
+    world, ahead, usual = scene
+    limits = [world.candidate(name, "drive") for name in ("saturation", "rate_limit")]
+    gain = world.candidate("gain", "drive")
+    columns = columns_of(scene, [*limits, gain])
+    begun = columns.simulated
+    count = lambda c: sum(o.candidate is c for o in columns.options)
+    before = {c: count(c) for c in (*limits, gain)}
+    columns.secants(Evidence(ahead, columns.residual, columns.array))
+    assert all(before[c] and count(c) == before[c] for c in limits)
+    assert count(gain) > before[gain] and columns.simulated - begun == count(gain) - before[gain]

@@ -254,12 +254,30 @@ def test_what_became_nominal_is_no_finding(search):
         asked.append((setting, steps))
         return SimpleNamespace(setting=setting)
 
-    judge = SimpleNamespace(fit=fit)
-    both = SimpleNamespace(setting={friction: (0.1,), stiffness: stiffness.nominal})
+    judge, none = SimpleNamespace(fit=fit), SimpleNamespace(options=[])
+    both = SimpleNamespace(setting={friction: (0.1,), stiffness: stiffness.nominal}, columns=none)
     assert changing(judge, both).setting == {friction: (0.1,)}
     assert asked == [({friction: (0.1,)}, 0)]
-    kept = SimpleNamespace(setting={friction: (0.1,)})
+    kept = SimpleNamespace(setting={friction: (0.1,)}, columns=none)
     assert changing(judge, kept) is kept and len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    "shown, left",
+    [
+        ([[1, 0]], (-0.5, np.inf)),
+        ([[0, 1]], (-np.inf, 0.6)),
+        ([[1, 0], [0, 1]], (-0.5, 0.6)),
+        (None, None),
+    ],
+)
+def test_a_stop_on_a_side_where_none_is_met_is_no_finding(search, shown, left):
+    """What moves no prediction, of a joint that has none."""
+    stop = search.world.candidate("joint_stop", "shoulder")
+    options = [SimpleNamespace(candidate=stop, directions=np.array(shown))] if shown else []
+    stopped = SimpleNamespace(setting={stop: (-0.5, 0.6)}, columns=SimpleNamespace(options=options))
+    judge = SimpleNamespace(fit=lambda setting, steps: SimpleNamespace(setting=setting))
+    assert changing(judge, stopped).setting == ({stop: left} if left else {})
 
 
 def leaves(search, names, loss, angle):
@@ -317,13 +335,19 @@ def test_another_end_is_taken_where_it_is_better_and_earned(
     same = fitted(search, ["coulomb_friction"], 0.0)  # by the judge of the other search
     same.loss = -1.0
     judge = SimpleNamespace(fit=lambda setting: same if setting else nothing)
+    locate = lambda setting, trajectory, passes: (tuple(setting), trajectory)
     again = SimpleNamespace(fitted=fitted(search, ["armature"], 0.0, bool(settled)), judge=judge)
+    again.smoother, again.trajectory = SimpleNamespace(locate=locate), "of its last round"
     again.fitted.loss = loss
     again.fitted.score = Score(loss, loss + 1e-3 * np.arange(16), 3 * loss * np.ones(16), ())
     monkeypatch.setattr(search, "finer", lambda judge, fitted: fitted)
     monkeypatch.setattr(search, "pruned", lambda judge, fitted, now: fitted)
-    monkeypatch.setattr(identification, "replace", lambda found, fitted: found)
-    assert search._better_end(again, before) is (again if better else None)
+    replace = lambda found, **new: SimpleNamespace(**vars(found) | new)
+    monkeypatch.setattr(identification, "replace", replace)
+    ended = search._better_end(again, before)
+    assert (ended and ended.fitted) is (again.fitted if better else None)
+    if better:  # the motion is that under what it ends with
+        assert ended.trajectory == (tuple(again.fitted.setting), "of its last round")
 
 
 def test_rounds_begun_elsewhere_go_on_only_where_they_are_better(search, monkeypatch):
@@ -399,3 +423,21 @@ def test_what_finer_steps_explain_as_well_is_no_physics(search, monkeypatch):
     assert search._ended(None, armature, now) is armature
     step = SimpleNamespace(setting={search.world.candidate("time_step", "world"): ()}, loss=-1.0)
     assert search._ended(None, step, now) is step
+
+
+def test_beside_limits_that_small_changes_do_not_tell_of_the_others_are_tried_too(
+    search, monkeypatch
+):
+    """Two limits, of which it is as if none missed them, leave two places to what is missed
+    least."""
+    limits = [search.world.candidate("saturation", f"{j}_motor") for j in ("shoulder", "elbow")]
+    names = "armature", "stiffness", "viscous_damping"
+    others = [search.world.candidate(name, "elbow") for name in names]
+    losses = dict(zip([*limits, *others], (-np.inf, -np.inf, -0.9, -0.8, -0.7)))
+    whole = SimpleNamespace(setting=dict.fromkeys([*others, *limits], ()), loss=-1.0)
+    left = lambda fitted, c: SimpleNamespace(loss=losses[c])
+    monkeypatch.setattr(identification, "without", left)
+    monkeypatch.setattr(search, "earned", lambda before, after: before.loss == -0.7)
+    assert search._missed_least(whole) == [*limits, *others[:2]]
+    losses[others[1]] = -0.7  # it is needed, as the last one is
+    assert search._missed_least(whole) == [*limits, others[0]]

@@ -25,10 +25,11 @@ PENDULUM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><world
   <actuator><motor name="drive" joint="pivot" gear="{gear}"/></actuator></mujoco>"""
 
 
-def run(seed, damping=0.05, friction=0.0, gear=1.0, rows=800, noise=3e-4):
+def run(seed, damping=0.05, friction=0.0, gear=1.0, rows=800, noise=3e-4, stops=""):
     """A Recording of the pendulum in stock MuJoCo, rows 10 ms apart."""
     rng = np.random.default_rng(seed)
     xml = PENDULUM.format(damping=damping, friction=friction, gear=gear)
+    xml = xml.replace('name="pivot"', f'name="pivot" {stops}')
     model = mujoco.MjModel.from_xml_string(xml)
     data, time = mujoco.MjData(model), 0.01 * np.arange(rows)
     period, phase = rng.uniform(0.6, 1.5, 3), rng.uniform(0, 6, 3)
@@ -83,6 +84,17 @@ def test_sets_that_explain_alike_leave_alike():
     assert np.linalg.norm(damping) == pytest.approx(1.0)
     assert damping @ back_emf > 0.99
     assert abs(damping @ one("gain", "drive")) < 0.8
+
+
+def test_a_stop_that_had_one_side_may_have_another_one_later():
+    """What one side alone does not show may show with other values."""
+    low, high = -0.5, 0.6
+    judge = judge_of(stops=f'range="{np.degrees(low)} {np.degrees(high)}"')
+    stop = judge.ahead.world.candidate("joint_stop", "pivot")
+    judge.fit({stop: (-0.4, 1e6)}, steps=0)
+    fresh = Judge(judge.ahead, judge.usual, judge.reference)
+    again, anew = (one.fit({stop: (-0.48, 0.57)}).setting[stop] for one in (judge, fresh))
+    assert again == pytest.approx(anew, abs=1e-4) and anew == pytest.approx((low, high), abs=0.01)
 
 
 def test_values_stay_inside_what_is_plausible():

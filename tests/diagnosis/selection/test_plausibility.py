@@ -1,11 +1,22 @@
 """Priors in units of the machine: centred on the model, bounded by physics, dear where far off."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import DRIVEN_PENDULUM, arm, record, recorded
+from plants import (
+    DRIVEN_PENDULUM,
+    arm,
+    commanded,
+    driven_by,
+    on_spring,
+    record,
+    recorded,
+    stepped,
+)
 from scipy import stats
 
 from diagnosis.selection.plausibility import TAIL, Prior, Usual, at_limit, plausible, possible
@@ -27,7 +38,10 @@ def test_every_effect_of_the_catalogue_has_a_prior_about_its_nominal_values(mach
         finite = np.isfinite(nominal)
         assert (prior.centre[finite] == nominal[finite]).all(), c
         assert (prior.low <= prior.high).all() and (prior.scale > 0).all(), c
-        assert prior.inside(np.where(finite, nominal, prior.high)), c
+        shape = np.arange(len(nominal)) >= (c.effect.amplitudes or len(nominal))
+        # of a shape nothing is nominal
+        inside = np.where(finite & ~shape, nominal, prior.high)
+        assert prior.inside(inside), c
         physical = [(p.low, p.high) for p in c.parameters]
         for (low, high), own_low, own_high, n in zip(physical, prior.low, prior.high, nominal):
             assert own_low >= min(low, n) and own_high <= max(high, n), c
@@ -140,3 +154,52 @@ def test_a_servo_saturates_beside_what_it_gave_and_a_motor_beside_what_it_was_as
     low = plausible(world.candidate("saturation", "drive"), usual).low[0]
     most = np.quantile(abs(law), 0.995)
     assert low == pytest.approx(0.05 * most * (0.1 if servo else 1.0))
+
+
+@pytest.mark.parametrize("located", [False, True])
+def test_a_force_that_its_limit_cuts_says_nothing_of_how_much_was_asked_for(located):
+    """A servo that asks for 1500 N·m and may give 50 may well give less."""
+    world, run = stepped()
+    lacking = np.zeros_like(run.qpos) if located else None
+    usual = Usual(world, [run], np.ones(1), lacking=lacking)
+    prior = plausible(world.candidate("saturation", "m"), usual)
+    assert prior.low == pytest.approx([0.05 * 50]) and prior.high[0] > 75
+
+
+def test_a_spring_is_as_stiff_as_its_force_over_how_far_it_is_bent():
+    """Far from zero, near to where it is at rest."""
+    world, run = on_spring(rest=np.pi / 3)
+    usual = Usual(world, [run], np.array([3.0]))
+    assert usual.travel == pytest.approx([0.05], rel=0.02)
+    spring, bent = (world.candidate(name, "j") for name in ("stiffness", "nonlinear_stiffness"))
+    prior = plausible(spring, usual)
+    assert prior.inside([130.0]) and prior.inside([0.0]) and not prior.inside([1000.0])
+    assert plausible(bent, usual).high == pytest.approx([5 * 3.0 / usual.travel[0] ** 3])
+
+
+@pytest.mark.parametrize("effect, at", [("friction_map", 2), ("cogging", 1)])
+def test_a_wave_turns_once_within_the_recorded_travel_at_least(effect, at):
+    """Less may be of any shape."""
+    world, _ = driven_by('<motor name="m" joint="j"/>')
+    time = 0.01 * np.arange(400)
+    run = commanded(time, np.zeros((400, 1)))
+    run = replace(run, qpos=np.linspace(-1, 1, 400)[:, None])
+    usual, wave = Usual(world, [run], np.ones(1)), world.candidate(effect, "j")
+    prior, values = plausible(wave, usual), np.array(wave.nominal)
+    assert prior.low[at] == pytest.approx(np.pi, rel=0.03)  # but for rare ends
+    values[0] = 0.5
+    for number, allowed in ((0.8 * np.pi, False), (1.2 * np.pi, True), (40.0, True)):
+        values[at] = number
+        assert possible(wave, values, prior) == allowed
+
+
+def test_friction_has_fallen_at_the_speed_that_is_usual():
+    """What still falls beyond is another law of friction."""
+    world, _ = driven_by('<motor name="m" joint="j"/>')
+    angle = 5 * 0.01 * np.arange(400)
+    run = replace(commanded(angle / 5, np.zeros((400, 1))), qpos=np.sin(angle)[:, None])
+    usual, stribeck = Usual(world, [run], np.ones(1)), world.candidate("stribeck_friction", "j")
+    prior = plausible(stribeck, usual)
+    assert prior.high[2] == pytest.approx(5 / np.sqrt(2), rel=0.02)
+    for speed, allowed in ((0.05, True), (3.0, True), (4.0, False)):
+        assert possible(stribeck, np.array([0.1, 0.2, speed]), prior) == allowed

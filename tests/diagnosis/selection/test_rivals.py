@@ -20,9 +20,10 @@ class Named:
 
     def __init__(self, name, units):
         self.name = name
-        overrides = {"overrides": lambda what: False}
-        self.effect = SimpleNamespace(simplicity=units - 1, name=name, numerical=False, **overrides)
-        self.parameters = (None,)
+        known = {"overrides": lambda what: False, "id": lambda model, name: 0}
+        known["twin"] = lambda model, i: None
+        self.effect = SimpleNamespace(simplicity=units - 1, name=name, numerical=False, **known)
+        self.parameters, self.place = (None,), SimpleNamespace(name="elbow")
 
 
 DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)
@@ -45,7 +46,8 @@ def chosen(monkeypatch, fitted, losses, sensors=(), asked=None):
 
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
-    chain = SimpleNamespace(world=None, apart=lambda c: c.name in sensors)
+    world = SimpleNamespace(model=None)
+    chain = SimpleNamespace(world=world, apart=lambda c: c.name in sensors)
     lacks = [Score(size, np.full(4, size), np.full(4, 4 * size), ()) for size in (1.0, 0.0)]
     silent = SimpleNamespace(scores=lambda *settings: lacks if sensors else None, chain=chain)
     monkeypatch.setattr(rivals, "_near", lambda *args: [])
@@ -93,23 +95,29 @@ def test_forces_speak_against_no_sensor(monkeypatch):
         assert chosen(monkeypatch, "coulomb", close, [one])[1] == {"coulomb": ["stribeck"]}
 
 
-def test_the_same_effect_in_a_like_place_is_tried_at_the_findings_own_value(monkeypatch):
-    """Two geoms of one contact share its numbers."""
-    foot, ground, elsewhere, other = (Named(n, 1) for n in ("foot", "ground", "else", "other"))
-    ground.effect = elsewhere.effect = foot.effect
-    foot.nominal = ground.nominal = (100.0,)
-    elsewhere.nominal = other.nominal = (50.0,)
-    begun = []
+FEET = """<mujoco><worldbody><geom name="floor" type="plane" size="5 5 .1"/>
+  <body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><joint type="slide" axis="1 0 0"/>
+  <geom name="left" type="box" size=".1 .1 .1" pos="-.5 0 0"/>
+  <geom name="right" type="box" size=".1 .1 .1" pos=".5 0 0"/></body></worldbody></mujoco>"""
+
+
+def test_the_floor_is_tried_for_a_foot_at_the_findings_own_value_and_no_other_foot(monkeypatch):
+    """Two geoms of one contact share its numbers; feet that are alike do not."""
+    world, begun = World(mujoco.MjSpec.from_string(FEET)), []
+    foot, floor, right = (
+        world.candidate("contact_friction", n) for n in ("left", "floor", "right")
+    )
+    assert foot.nominal == floor.nominal == right.nominal
+    damping = world.candidate("contact_damping", "floor")
     judge = SimpleNamespace(
         fit=lambda setting, **how: begun.append(setting) or SimpleNamespace(settled=False)
     )
-    monkeypatch.setattr(rivals, "_alike", lambda *args: [(other, (5.0,)), (ground, (362.0,))])
-    monkeypatch.setattr(rivals, "_near", lambda *args: [ground, elsewhere, other])
+    monkeypatch.setattr(rivals, "_alike", lambda *args: [(damping, (5.0,)), (floor, (0.9,))])
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: None)
-    before = SimpleNamespace(chain=SimpleNamespace(world=None))
-    fitted = SimpleNamespace(setting={foot: (220.0,)})
-    rivals._members([], judge, before, fitted, foot, None)
-    assert begun == [{ground: (220.0,)}, {other: (5.0,)}]
+    before = SimpleNamespace(chain=SimpleNamespace(world=world))
+    fitted = SimpleNamespace(setting={foot: (0.2,)})
+    rivals._members(world.candidates, judge, before, fitted, foot, None)
+    assert begun == [{floor: (0.2,)}, {damping: (5.0,)}]
 
 
 GAIN, DAMPING, MASS, ARMATURE = (

@@ -1,11 +1,12 @@
 """Where effects are begun: how large steps are, and which waves the located force chooses."""
 
 import copy
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
-from plants import DRIVEN_PENDULUM, recorded
+from plants import DRIVEN_PENDULUM, DROP, commanded, driven_by, dropped, recorded
 
 from diagnosis.effects.friction import TURNS
 from diagnosis.effects.joints import JointStop
@@ -45,17 +46,20 @@ def test_a_stop_on_one_side_has_a_step_for_that_side_alone(machine):
 
 
 def test_a_stop_is_begun_on_either_side_alone(machine):
+    """The other side is where the joint goes farthest, from where it may move."""
     world, usual = machine
     stop = world.candidate("joint_stop", "pivot")
-    starts = Starts(world, {}, usual).of([stop])
-    met = [abs(s.base + row) < JointStop.NEVER for s in starts for row in s.directions]
-    assert {(True, False), (False, True), (True, True)} == {tuple(row) for row in met}
     position = usual.recordings[0].qpos[:, 0]
+    starts = Starts(world, {}, usual).of([stop])
+    ends = [tuple(s.base + row) for s in starts for row in s.directions]
+    met = {(bool(low > position.min()), bool(high < position.max())) for low, high in ends}
+    assert met == {(True, False), (False, True), (True, True)}
+    low, high = next(end for end in ends if end[1] >= position.max())
+    assert high == position.max() and position.min() < low < position.max()
     model, motion = world.model, copy.deepcopy(world.model)
-    low, high = next(v for s in starts for v in [s.base + s.directions[0]] if v[1] > 1e5)
-    stop.effect.edit(motion, 0, (low, high))
-    assert motion.jnt_limited[0] and position.min() < motion.jnt_range[0, 0] < position.max()
-    assert motion.jnt_range[0, 1] == JointStop.NEVER and not model.jnt_limited[0]
+    stop.effect.edit(motion, 0, (low, np.inf))
+    assert motion.jnt_limited[0] and motion.jnt_range[0].tolist() == [low, JointStop.NEVER]
+    assert not model.jnt_limited[0]
 
 
 @pytest.mark.parametrize("effect, begun", [("mass", 3), ("center_of_mass", 7), ("gain", 3)])
@@ -111,3 +115,56 @@ def test_a_drives_bias_is_as_plausible_as_the_springs_offset_that_it_equals(mach
     )
     for field in ("scale", "low", "high"):
         np.testing.assert_allclose(getattr(bias, field), getattr(offset, field))
+
+
+def test_what_is_nominally_zero_is_begun_at_a_usual_size():
+    """A servo without damping of its own, a floor without friction: of zero no share is a scale."""
+    world, _ = driven_by('<position name="m" joint="j" kp="30"/>')
+    damping, usual = (
+        world.candidate("servo_damping", "m"),
+        Usual(world, [moving(world)], np.ones(1)),
+    )
+    prior = plausible(damping, usual)
+    assert damping.nominal == (0.0,) and np.isfinite(prior.scale).all()
+    assert prior.high[0] == pytest.approx(5.0 / usual.speed[0])
+    starts = Starts(world, {}, usual).of([damping])
+    assert starts and all((s.base + s.directions > 0).all() for s in starts)
+    spec = mujoco.MjSpec.from_string(DROP.format(damping=-40))
+    for geom in spec.geoms:
+        geom.friction = np.zeros(3)
+    slippery = World(spec)
+    grip, usual = slippery.candidate("contact_friction", "block"), [dropped(0, -40)]
+    prior = plausible(grip, Usual(slippery, usual, np.ones(1)))
+    assert grip.nominal == (0.0,) and np.isfinite(prior.scale).all() and prior.inside([0.5])
+
+
+def moving(world):
+    """A run of one joint that swings by a radian, at up to 5 rad/s."""
+    time = 0.01 * np.arange(400)
+    run = commanded(time, np.zeros((400, world.model.nu)))
+    return replace(run, qpos=np.sin(5 * time)[:, None])
+
+
+def test_friction_that_falls_is_begun_with_more_than_the_joint_has():
+    spec = mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5))
+    spec.joint("pivot").frictionloss = 0.3
+    world = World(spec)
+    usual = Usual(world, [recorded("run.csv", 3)], np.ones(1))
+    stribeck = world.candidate("stribeck_friction", "pivot")
+    assert stribeck.nominal[:2] == (0.3, 0.3)
+    starts = Starts(world, {}, usual).of([stribeck])
+    begun = np.array([s.base + s.low * row for s in starts for row in s.directions])
+    assert len(begun) and (begun[:, 0] > 0.3).all() and (begun[:, 1] > begun[:, 0]).all()
+
+
+@pytest.mark.parametrize("effect", ["friction_map", "cogging", "stribeck_friction"])
+def test_all_that_is_begun_of_a_shape_is_plausible(effect):
+    """Whatever is worth a try lies inside the bounds, and no start is left out for them."""
+    world, _ = driven_by('<motor name="m" joint="j"/>')
+    usual = Usual(world, [moving(world)], np.ones(1))
+    candidate = world.candidate(effect, "j")
+    prior, probes = plausible(candidate, usual), world.probes(candidate, usual.recordings)
+    assert (probes[:, 2 if effect == "friction_map" else 1] >= 0).all()
+    starts = Starts(world, {}, usual).of([candidate])
+    assert sum(len(s.directions) for s in starts) == len(probes)
+    assert all(prior.inside(s.base + row) for s in starts for row in s.directions)

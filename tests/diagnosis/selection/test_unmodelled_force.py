@@ -88,7 +88,7 @@ def test_a_ripple_that_grows_with_speed_depends_on_position_and_velocity():
     assert found.variables == ("position:j", "velocity:j") and found.share > 0.7
     assert found.candidate.effect.factor == "speed:j" and found.candidate.effect.wave
     force, scatter = trajectory.force[~trajectory.free, 0], trajectory.located()[1][0]
-    most = CLIP * 1.4826 * np.median(abs(force))
+    most = CLIP * max(1.4826 * np.median(abs(force)), np.sqrt(np.mean(force**2)))
     size = np.sqrt(found.share * np.mean(np.clip(force, -most, most) ** 2))
     assert found.above == pytest.approx(size / scatter)
 
@@ -141,6 +141,16 @@ def test_a_curve_bends_where_its_force_does_and_nowhere_else():
     assert len(near) > 4
     bent = dependences(*made_up(lambda q, v, u, t: at(0, -0.3 * np.maximum(q[:, 0], 0)), 0.1))[0]
     assert bent.variables == ("position:j",) and len(bent.values) < 7
+
+
+def test_a_force_that_mostly_is_not_there_is_as_large_as_where_it_is():
+    """A stiff stop, met in 28 % of all rows."""
+    stop = lambda q: -20 * np.maximum(q[:, 0] - np.quantile(q[:, 0], 0.72), 0.0)
+    world, trajectory, runs = made_up(lambda q, v, u, t: at(0, stop(q)))
+    found = dependences(world, trajectory, runs)[0]
+    assert found.variables == ("position:j",) and found.share > 0.9
+    peak = np.quantile(abs(stop(trajectory.qpos)), 0.995)
+    assert np.abs(found.values).max() == pytest.approx(peak, rel=0.1)
 
 
 def test_chosen_knots_predict_no_force_that_wanders_by_itself():

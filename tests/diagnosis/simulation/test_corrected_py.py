@@ -12,7 +12,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco.batch import Batch
-from plants import DT, SIZES, START, T, arm, commanded, pendulum, record, simulate
+from plants import (
+    DT,
+    SIZES,
+    START,
+    WEAKER,
+    T,
+    arm,
+    commanded,
+    pendulum,
+    record,
+    simulate,
+    tight,
+)
 
 from diagnosis.effects.base import Part
 from diagnosis.effects.friction import friction_curve
@@ -137,6 +149,52 @@ def test_a_delay_of_less_than_a_step_beside_a_dead_zone(tmp_path):
     np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9)
     whole = {world.candidate("delay", "bend"): (0.002,)}
     assert set(world.corrected_xml(whole)[1].values()) == {"mjcf"}
+
+
+@pytest.mark.parametrize("effect", WEAKER)
+def test_a_drive_that_fades_stays_within_the_joints_range(tmp_path, effect):
+    """Simulated, and by the script: as stock MuJoCo moves by a motor that gives what is left."""
+    world, (values, weaker) = tight(), WEAKER[effect]
+    recording = commanded(np.arange(ROWS) * DT, np.full((ROWS, 1), 0.5))
+    model, expected = pendulum().model, []
+    data = mujoco.MjData(model)
+    data.qpos[0], data.qvel[0] = START[0][0], START[1][0]
+    for _ in range(ROWS):
+        expected.append(data.qpos.copy())
+        for _ in range(round(DT / model.opt.timestep)):
+            left = weaker(50 * (0.5 - data.qpos[0]), data.qvel[0], data.time)
+            data.ctrl[0] = np.clip(left, -1, 1)
+            mujoco.mj_step(model, data)
+    setting, window = {world.candidate(effect, "m"): values}, Window(recording, 0, ROWS - 1)
+    parts, _ = script_of(tmp_path, world, setting)
+    script = in_script(tmp_path, parts, recording)
+    (qpos,) = world.simulate([setting], [START[0][:1]], [START[1][:1]], [window])[0]
+    (nominal,) = world.simulate([{}], [START[0][:1]], [START[1][:1]], [window])[0]
+    assert abs(nominal - expected).max() > 1e-3
+    np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(script, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["motors", "servos"])
+def test_what_depends_on_the_true_position_does_so_where_its_sensor_is_off(tmp_path, kind):
+    """Of a friction map of ten waves a radian 0.3 rad is half a wave; knots move along too."""
+    world, _ = arm(kind)
+    recording, make = record(world), world.curve
+    some = [
+        {world.candidate("friction_map", "elbow"): (0.15, 0.8, 10.0, 0.4)},
+        {friction_curve(world.model, "elbow", (-0.4, -0.3, 0.1)): (0.3, 0.0, 0.2)},
+        {make("swing", "position:elbow", (-0.4, -0.3, 0.1)): (0.3, -0.3, 0.2)},
+        {make("elbow", "position:elbow", (0.0, 0.1), "speed:swing", wave=True): (0.3, 0.2)},
+    ]
+    bias = world.candidate("sensor_bias", "elbow")
+    settings = [{**setting, bias: (0.3,)} for setting in some]
+    plain = simulate(world, [{bias: (0.3,)}], recording, ROWS)[0]
+    for setting, expected in zip(settings, simulate(world, settings, recording, ROWS)):
+        parts, written = script_of(tmp_path, world, setting)
+        assert parts and written[bias] == "mjcf"
+        qpos = in_script(tmp_path, parts, recording)
+        np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9, err_msg=str(parts))
+        assert abs(expected - plain).max() > 1e-3, parts
 
 
 def test_a_setting_that_mjcf_holds_needs_no_script():

@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import rollout
+from plants import FILTER, INTEGRATOR, driven_by, there_and_back
 
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.rows import RowMap
-from diagnosis.simulation.simulator import World
+from diagnosis.simulation.simulator import Window, World
 
 ARM = """<mujoco><option timestep="0.002" density="1.2"/><default>
   <geom contype="0" conaffinity="0"/></default><worldbody>
@@ -140,17 +141,49 @@ def test_rows_that_are_skipped_cost_nothing_and_change_no_other():
     assert set(map(tuple, asked)) == {(0, 2)}
 
 
-def test_a_constant_push_on_a_body_is_one_in_its_joints():
+def test_a_constant_push_on_a_body_turns_with_it_within_a_row():
+    """As in plain steps, and as in a simulation of the row."""
     here = world()
-    run = uneven(here.model)
-    rows = RowMap(here, [run], {here.candidate("external_force", "b"): (1.0, 0.0, -2.0)})
+    run, push = uneven(here.model), (1.0, 0.0, -2.0)
+    setting = {here.candidate("external_force", "b"): push}
+    rows = RowMap(here, [run], setting)
     qpos, qvel, force = some_states(here.model, len(rows.begin))
     q, v = rows.ahead(np.arange(len(rows.begin)), qpos, qvel, force)
     for k, row in enumerate(rows.begin):
         data = mujoco.MjData(here.model)
         data.qpos[:], data.qvel[:], data.qfrc_applied[:] = qpos[k], qvel[k], force[k]
-        data.ctrl[:], data.xfrc_applied[2, :3] = run.ctrl[row], (1.0, 0.0, -2.0)
+        data.ctrl[:], data.xfrc_applied[2, :3] = run.ctrl[row], push
         count = round((run.time[row + 1] - run.time[row]) / 0.002)
         mujoco.mj_step(here.model, data, count)
-        # the force turns with the arm inside a row, which the row takes as it begins
-        assert np.abs(v[k] - data.qvel).max() < 0.02 * np.abs(data.qvel - qvel[k]).max() + 2e-3
+        np.testing.assert_allclose(q[k], data.qpos, atol=1e-9)
+        np.testing.assert_allclose(v[k], data.qvel, atol=1e-9)
+    windows = [Window(run, row, row + 1) for row in rows.begin]
+    simulated = here.simulate([setting] * len(windows), qpos, qvel, windows)
+    for own, other in zip(rows.ahead(np.arange(len(windows)), qpos, qvel, 0 * force), simulated):
+        np.testing.assert_allclose(own, other[:, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("actuator", [FILTER, INTEGRATOR])
+def test_rows_begin_with_what_an_actuator_has_added_up(actuator):
+    """A control that comes late through a filter, and one that is summed within a range: row by row
+    as in one run."""
+    here, _ = driven_by(actuator)
+    run, *_ = there_and_back(here)
+    setting = {here.candidate("delay", "m"): (0.04,)} if actuator == FILTER else {}
+    qpos, qvel = (x[0] for x in here.simulate([setting], [[0.3]], [[0.5]], [Window(run, 0, 119)]))
+    rows = RowMap(here, [run], setting)
+    q, v = rows.ahead(np.arange(119), qpos[:-1], qvel[:-1], np.zeros((119, 1)))
+    np.testing.assert_allclose(q, qpos[1:], atol=1e-9)
+    np.testing.assert_allclose(v, qvel[1:], atol=1e-9)
+
+
+def test_derivatives_by_force_work_out_no_load_again(monkeypatch):
+    """It depends on the states alone: once where they are, and once where each is moved."""
+    here, asked = world(), []
+    run = uneven(here.model)
+    rows = RowMap(here, [run], {here.candidate("load_friction", "j"): (0.2, 0.3, 1.0)})
+    stage = mujoco.mj_fwdVelocity
+    monkeypatch.setattr(mujoco, "mj_fwdVelocity", lambda *given: asked.append(1) or stage(*given))
+    count, nv = len(rows.begin), here.model.nv
+    rows.linearised(*some_states(here.model, count), np.ones(nv), np.zeros(count, bool))
+    assert len(asked) == (1 + 2 * nv) * count

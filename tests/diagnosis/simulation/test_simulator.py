@@ -5,7 +5,24 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from plants import ARM, DT, MODELS, SIZES, START, T, arm, commanded, pendulum, record, simulate
+from plants import (
+    ARM,
+    DT,
+    FILTER,
+    INTEGRATOR,
+    MODELS,
+    SIZES,
+    START,
+    T,
+    arm,
+    commanded,
+    driven_by,
+    pendulum,
+    record,
+    simulate,
+    stock,
+    there_and_back,
+)
 
 from diagnosis.effects.base import end_of_step
 from diagnosis.simulation.control_signal import Signal
@@ -121,6 +138,53 @@ def test_muscles_go_on_too():
     q, v = map(np.array, zip(*states))
     later = world.simulate([{}], q[12:13], v[12:13], [Window(recording, 12, 39)])[0]
     np.testing.assert_allclose(later[0], q[12:], rtol=0, atol=1e-9)
+
+
+def test_a_filtered_control_that_comes_late_goes_on_too():
+    """From the middle of a run as from its beginning, which is stock MuJoCo's."""
+    world, _ = driven_by(FILTER)
+    recording, setting = record(world), {world.candidate("delay", "m"): (0.04,)}
+    q, v = world.simulate([setting], [[0.3]], [[0.5]], [Window(recording, 0, T - 1)])
+    there = stock(world.corrected_xml(setting)[0], world, recording, [0.3], [0.5])
+    np.testing.assert_allclose(q[0], there, rtol=0, atol=1e-9)
+    later = world.simulate([setting], q[:, 20], v[:, 20], [Window(recording, 20, T - 1)])[0]
+    np.testing.assert_allclose(later[0], q[0, 20:], rtol=0, atol=1e-9)
+
+
+def test_what_an_actuator_adds_up_stays_at_its_end_until_it_is_asked_to_return():
+    """A goal that moves to an end of its range and on, then back: from there, in stock MuJoCo."""
+    world, _ = driven_by(INTEGRATOR)
+    recording, q, v = there_and_back(world)
+    later = world.simulate([{}], q[100:101], v[100:101], [Window(recording, 100, 119)])[0]
+    np.testing.assert_allclose(later[0], q[100:], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("delay, steps", [(0.013, 2), (0.02, 2), (0.004, 1)])
+def test_a_delay_of_the_model_lasts_whole_steps(delay, steps):
+    motor = f'<motor name="m" joint="j" delay="{delay}" nsample="3"/>'
+    _, xml = driven_by(motor)
+    xml = xml.replace('timestep="0.001"', 'timestep="0.01"')
+    world = World(mujoco.MjSpec.from_string(xml))
+    assert world.candidate("delay", "m").nominal == (pytest.approx(0.01 * steps),)
+    recording = record(world)
+    qpos, _ = world.simulate([{}], [[0.3]], [[0.5]], [Window(recording, 0, T - 1)])
+    expected = stock(xml, world, recording, [0.3], [0.5])
+    np.testing.assert_allclose(qpos[0], expected, rtol=0, atol=1e-12)
+
+
+def test_a_body_that_is_welded_to_a_link_belongs_to_its_joint():
+    world = World(
+        mujoco.MjSpec.from_string("""<mujoco><worldbody><body name="base"><geom size=".1"/>
+            <body name="link"><joint name="i" axis="0 1 0"/><joint name="j" axis="1 0 0"/>
+            <geom size=".1"/><body name="tool"><geom size=".1"/><body name="tip"><geom size=".1"/>
+            </body></body><body name="hand"><joint name="k"/><geom size=".1"/></body>
+            </body></body></worldbody></mujoco>""")
+    )
+    own = {c.place.name: world.joints(c.place) for c in world.candidates if c.place.kind == "body"}
+    joint = {name: world.model.joint(name).id for name in "ijk"}
+    for body in ("link", "tool", "tip"):
+        assert own[body] == {joint["i"], joint["j"]}
+    assert own["hand"] == {joint["k"]}
 
 
 BALLS = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
