@@ -5,6 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from diagnosis.estimation import prediction_error, windowing
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import Window, World
 
@@ -278,6 +279,13 @@ DRIVEN_PENDULUM = """<mujoco><option timestep="0.005"/><worldbody><body name="ar
   <actuator><motor name="drive" joint="pivot"/></actuator></mujoco>"""
 
 NOISE = 5e-4
+
+
+def reported_error(world, setting, recordings, noise):
+    """(error in noises, {channel: SI}) of a setting over windows as the contract has them."""
+    windows = prediction_error.consecutive(recordings, windowing.HORIZON)
+    predicted, _ = prediction_error.predict(world, setting, windows)
+    return windowing.error(world.model, windows, predicted, noise)
 
 
 def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=NOISE, finer=1):

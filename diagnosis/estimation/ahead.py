@@ -12,6 +12,7 @@ import numpy as np
 
 from diagnosis.effects.base import runge_kutta
 from diagnosis.estimation import windowing
+from diagnosis.estimation.prediction_error import consecutive
 from diagnosis.simulation.simulator import step_of
 
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
@@ -27,13 +28,18 @@ def cut_ahead(recordings, longest=HORIZONS[-1]):
     seconds = [r.time[-1] - r.time[r.start] for r in recordings]
     sample = windowing.sampling(recordings)
     longest = max(min(longest, sum(seconds) / FEWEST), 12 * sample)
-    windows = [w for r in recordings for w in windowing.consecutive(r, longest, r.start)]
+    windows = consecutive(recordings, longest)
     return [windows[i] for i in windowing.evenly(len(windows), MOST)]
 
 
 def with_own_step(setting):
     """A setting with the simulator's own time step in the place of a finer one."""
     return {c: v for c, v in setting.items() if not c.effect.numerical}
+
+
+def neighbours(number):
+    """Group (number,) of each of so many windows or rows in their order."""
+    return np.arange(number) * min(GROUPS, number) // max(number, 1)
 
 
 class Ahead:
@@ -49,37 +55,22 @@ class Ahead:
         self.measured = windowing.measured(windows)
         self.known = windowing.known(self.model, windows)
         self.known[:, 0] = False
-        count = self.measured.shape[1]
-        ahead = np.full((len(windows), count), np.nan)
-        for row, w in zip(ahead, windows):
-            row[: w.last - w.first + 1] = w.recording.time[w.first : w.last + 1]
-        self.seconds = ahead - ahead[:, :1]
+        time = windowing.measured(windows, "time")
+        self.seconds = time - time[:, :1]
         ends = np.nanmax(self.seconds) * np.array(HORIZONS) / HORIZONS[-1] * (1 + 1e-6)
         self.band = np.where(np.isnan(self.seconds), -1, np.searchsorted(ends, self.seconds))
         self.band[:, 0] = -1
         self.band[self.band >= len(ends)] = -1
-        number = min(GROUPS, len(windows))
-        self.group = np.arange(len(windows)) * number // len(windows)
+        self.group = neighbours(len(windows))
         self.channels = list(windowing.channels(self.model).values())
         self.noise, self.step = noise, self.model.opt.timestep
-        self.travel = self._travel()
+        gone = windowing.difference(self.model, self.measured[:, :1], self.measured)
+        gone = np.quantile(np.where(np.isfinite(gone), abs(gone), 0.0), 0.98, axis=(0, 1))
+        self.travel = np.maximum(3 * gone, 10 * np.where(np.isfinite(noise), noise, 1.0))
         self.qpos, self.qvel = windowing.recorded_starts(self.model, windows)
         self.spread = np.zeros((len(windows), 2 * self.model.nv))  # of start states
         self.base, self._freedom = {}, None
         self.coarse = {}  # {time_step: seconds} for columns; empty: the simulator's own
-
-    def _travel(self):
-        start = self.measured[:, :1]
-        gone = np.abs(
-            windowing.difference(
-                self.model, np.broadcast_to(start, self.measured.shape), self.measured
-            )
-        )
-        gone = np.where(np.isfinite(gone), gone, 0.0).reshape(-1, self.model.nv)
-        return np.maximum(
-            3 * np.quantile(gone, 0.98, axis=0),
-            10 * np.where(np.isfinite(self.noise), self.noise, 1.0),
-        )
 
     def start(self, trajectory, setting=None):
         """Begin the windows at a Trajectory's states; setting: that under which it was located."""

@@ -5,10 +5,8 @@ chain = Chain(world, windows, noise)
 chain.start(trajectory)
 residual = chain.residual([{}, {friction: (0.1,)}])    # (settings, W, T, nv), as Ahead's
 
-A simulator that lacks much soon leaves the measured motion, and what it would do there says little
-of the machine. So what is missing in each row is compared with what an effect does in the same row
-from the same measured state, and both run on through the same linear transitions: where the effect
-is the missing one they are equal, whatever its size.
+Where an effect is the missing one, what it does in a row is what is missing there, whatever its
+size: both run on through the same linear transitions.
 """
 
 import mujoco
@@ -20,15 +18,8 @@ from diagnosis.simulation.rows import RowMap, coarse
 
 GROUPED = 19  # rows in each group, in which forces are compared
 OUTSIDE = 0.1  # share of a located force that may hang by rows outside of the windows
-INERTIAL = (  # fields of a model that its inertia hangs by
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "body_iquat",
-    "body_pos",
-    "dof_armature",
-    "tendon_armature",
-)
+# fields of a model that its inertia hangs by
+INERTIAL = "body_mass body_inertia body_ipos body_iquat body_pos dof_armature tendon_armature"
 ASTRAY = 1e3  # times its travel, to where a chain of transitions at stiff stops may run away
 
 
@@ -135,8 +126,7 @@ class Chain(Ahead):
         return out
 
     def telling(self):
-        """Rows in which located forces are compared: from now on they are worked out along with
-        every prediction."""
+        """Rows in which located forces are compared, from now on along with every prediction."""
         if self.told is None:
             self.told, self.lacks = self._told(), self.missing(self.base, self.used)
         return self.told
@@ -152,14 +142,12 @@ class Chain(Ahead):
 
     def _along(self, settings, out):
         """Fill in what the chain predicts, the same once."""
-        done, keys = {}, [frozenset(setting.items()) for setting in settings]
-        for key, setting in zip(keys, settings):
-            done[key] = done[key] if key in done else self.missing(setting, self.used)
+        keys = [frozenset(setting.items()) for setting in settings]
+        done = {key: self.missing(s, self.used) for key, s in dict(zip(keys, settings)).items()}
         if self.told is not None:
             self._locate({key: m for key, m in done.items() if key not in self.located})
         grown = {key: self._grown(missing) for key, missing in done.items()}
-        for row, key in zip(out, keys):
-            row[:] = grown[key]
+        out[:] = [grown[key] for key in keys]
 
     def _locate(self, every):
         """Remember what smoothing would locate of {key: what is missing in the rows used}."""
@@ -232,8 +220,7 @@ class Chain(Ahead):
         return np.concatenate([gap, t.qvel[rows + 1] - qvel], 1)
 
     def _grown(self, missing):
-        """(W, T, nv): what is missing in the rows as the chain carries it on, and what was measured
-        beside the motion."""
+        """(W, T, nv): what is missing in the rows, carried on, and what was measured beside."""
         (W, T), nv = self.rows.shape, self.model.nv
         out, x = self.beside.copy(), np.zeros((W, 2 * nv))
         at = np.searchsorted(self.used, np.minimum(self.rows, self.used[-1]))
@@ -247,7 +234,9 @@ class Chain(Ahead):
 
 def _as_heavy(model, other):
     """Whether two models' inertia is the same in every position."""
-    return all(np.array_equal(getattr(model, name), getattr(other, name)) for name in INERTIAL)
+    return all(
+        np.array_equal(getattr(model, name), getattr(other, name)) for name in INERTIAL.split()
+    )
 
 
 def _times_mass(model, qpos, qvel):

@@ -1,20 +1,24 @@
 """95 % intervals that allow for dependence within groups, for few groups, and for the time step.
 
 bounds = intervals(fitted)          # {candidate: [(low, high) or None, ...]}
+line = one_number(gram, score)      # of one parameter, in closed form
 
 The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees
 of freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipton, Journal of
 Business and Economic Statistics 36 (2018).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from diagnosis.common.distributions import t_ppf
+from diagnosis.common.distributions import t_ppf, t_sf
 
 SHARED = 0.01  # of a direction that is not seen, the part beyond which a value is not told
 FLAT = 0.2  # of the squares' curvature, the least that the loss's is taken for
 ENDLESS = 2.0  # times what half the step changes: steps that are ever smaller
 UNSEEN = 1e-8  # share of a column's information that the others leave, below which it is not seen
+FEWEST = 4  # groups, below which their spread says nothing
 
 
 def intervals(fitted):
@@ -33,11 +37,8 @@ def intervals(fitted):
             k = int(np.flatnonzero(row)[0])
             ends = values[k] + row[k] * np.array([middle[at] - half[at], middle[at] + half[at], 0])
             if np.isfinite(ends).all():
-                low, high = (
-                    max(min(ends), option.prior.low[k]),
-                    min(max(ends), option.prior.high[k]),
-                )
-                out[c][k] = (float(low), float(high))
+                low, high = option.prior.low[k], option.prior.high[k]
+                out[c][k] = float(max(min(ends), low)), float(min(max(ends), high))
             at += 1
     return out
 
@@ -68,10 +69,7 @@ def without_step(fitted, index):
     most = half + ENDLESS / 2 * abs(each)  # the step can do no more than that, told or not
     told = np.isfinite(wide[:p]) & (wide[:p] <= most)
     amount = np.clip(amounts[p], 0.0, ENDLESS) if np.isfinite(wide[p]) else 0.0
-    return (
-        moves + np.where(told, amount, ENDLESS / 2) * each,
-        np.where(told, wide[:p], most),
-    )
+    return moves + np.where(told, amount, ENDLESS / 2) * each, np.where(told, wide[:p], most)
 
 
 def half_widths(evidence, index):
@@ -85,24 +83,17 @@ def half_widths(evidence, index):
     gram, score = each[:, 1:, 1:] / np.outer(scale, scale), each[:, 1:, 0] / scale
     whole = gram.sum(0)
     values, vectors = np.linalg.eigh(whole)
-    seen = values > UNSEEN
-    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
-    unseen = np.diag(np.eye(p) - vectors[:, seen] @ vectors[:, seen].T) > SHARED
+    values, vectors = values[values > UNSEEN], vectors[:, values > UNSEEN]
+    inverse, root, back, within = ((vectors * values**a) @ vectors.T for a in (-1, -0.5, 0.5, 0))
+    unseen = 1 - np.diag(within) > SHARED
     moves = inverse @ score.sum(0)
     left = score - gram @ moves
-    root = (vectors[:, seen] / np.sqrt(values[seen])) @ vectors[:, seen].T
-    back = (vectors[:, seen] * np.sqrt(values[seen])) @ vectors[:, seen].T
-    meat = np.zeros((p, p))
-    shares = np.empty((len(gram), p))
-    for k, (H, s) in enumerate(zip(gram, left)):
-        hat = root @ H @ root
-        e, u = np.linalg.eigh(hat)
-        factor = (u / np.sqrt(np.clip(1 - e, 0.05, 1.0))) @ u.T
-        corrected = back @ factor @ root @ s
-        meat += np.outer(corrected, corrected)
-        shares[k] = np.einsum("ij,jk,ki->i", inverse, H, inverse) / np.maximum(
-            np.diag(inverse), 1e-300
-        )
+    e, u = np.linalg.eigh(root @ gram @ root)
+    factor = (u / np.sqrt(np.clip(1 - e, 0.05, 1.0))[:, None]) @ np.swapaxes(u, 1, 2)
+    corrected = (back @ factor @ root @ left[..., None])[..., 0]
+    meat = corrected.T @ corrected
+    shares = np.einsum("ij,gjk,ki->gi", inverse, gram, inverse)
+    shares /= np.maximum(np.diag(inverse), 1e-300)
     curvature = _curvature(products.slopes(), weight, root / scale[:, None])
     bread = root @ np.linalg.inv(curvature) @ root.T
     covariance = bread @ meat @ bread
@@ -130,3 +121,26 @@ def _curvature(slopes, weight, root):
     less = np.einsum("gc,gci,gcj->ij", 2 * weight**2, score, score)
     values, vectors = np.linalg.eigh(np.eye(len(root)) - less)
     return (vectors * np.clip(values, FLAT, None)) @ vectors.T
+
+
+class Line(NamedTuple):
+    """value that removes most; half: half width of its 95 % interval; p_value: that it is 0."""
+
+    value: float
+    half: float
+    p_value: float
+
+
+def one_number(gram, score):
+    """The Line through groups' sums of slope² gram (G,) and slope · residual score (G,); p_value 1
+    and no width where too few groups see anything."""
+    gram, score = gram[gram > 0], score[gram > 0]
+    if len(gram) < FEWEST:
+        return Line(0.0, np.inf, 1.0)
+    total = gram.sum()
+    share, value = gram / total, score.sum() / total
+    left = (score - gram * value) / np.sqrt(np.clip(1 - share, 0.05, 1.0))
+    error = np.sqrt((left**2).sum()) / total
+    freedom = max(1 / (share**2).sum() - 1, 1.0)
+    chance = 2 * t_sf(abs(value) / max(error, 1e-300), freedom)
+    return Line(float(value), float(t_ppf(0.975, freedom) * error), float(chance))

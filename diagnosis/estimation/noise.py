@@ -7,7 +7,7 @@ measured
 import mujoco
 import numpy as np
 
-from diagnosis.estimation.windowing import channels, difference, joint_slices, pooled
+from diagnosis.estimation.windowing import difference, joint_slices, pooled
 from diagnosis.recordings.quality import encoder_quantum
 
 # of differences: what a smooth motion leaves falls with the order, noise does not
@@ -16,24 +16,15 @@ ORDERS = range(2, 9)
 
 def difference_noise(time, column):
     """Standard deviation of white noise in one column (T,), by divided differences on its time
-    stamps (T,).
-
-    Weights of a divided difference annihilate a polynomial on stamps as they are; scaled to a unit
-    norm they keep the noise's size. A quantile keeps impacts and standstill out. inf where nothing
-    moves.
-    """
+    stamps (T,), which annihilate a polynomial; their quantile keeps impacts and standstill out. inf
+    where nothing moves."""
     known = np.isfinite(column)
-    time, column, best = time[known], column[known], np.inf
+    time, column = time[known], column[known]
     if not len(column) or np.ptp(column) == 0:
         return np.inf
-    estimates = []
-    for order in ORDERS:
-        d = _divided(time, column, order)
-        if len(d) < 5:
-            break
-        estimates.append(np.quantile(np.abs(d), 0.8) / 1.2816)
-    if estimates:
-        best = min(estimates)
+    each = [_divided(time, column, order) for order in ORDERS]
+    estimates = [np.quantile(np.abs(d), 0.8) / 1.2816 for d in each if len(d) >= 5]
+    best = min(estimates, default=np.inf)
     if len(estimates) > 2:  # what still falls with the order is motion, and falls on
         best *= min(1.0, estimates[-1] / estimates[-3]) ** 2
     step = encoder_quantum(column)
@@ -55,20 +46,14 @@ def _divided(time, column, order):
 
 def measurement_noise(model, recordings):
     """Noise of each dof's position and velocity, (nv,), (nv,); inf where nothing was measured."""
-    position, velocity = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
+    noise = np.full((2, model.nv), np.inf)
     for dof in range(model.nv):
-        found = [
-            (
-                difference_noise(*_tangent_column(model, r, dof)),
-                difference_noise(r.time, r.qvel[:, dof]),
-            )
-            for r in recordings
-        ]
-        for noise, each in zip((position, velocity), np.array(found).T):
-            noise[dof] = np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else np.inf
-    for dofs in channels(model).values():  # components of one channel share their noise
-        position[dofs], velocity[dofs] = pooled(position[dofs]), pooled(velocity[dofs])
-    return position, velocity
+        columns = [(_tangent_column(model, r, dof), (r.time, r.qvel[:, dof])) for r in recordings]
+        for kind, own in enumerate(zip(*columns)):
+            each = np.array([difference_noise(*column) for column in own])
+            if np.isfinite(each).any():
+                noise[kind, dof] = np.median(each[np.isfinite(each)])
+    return pooled(model, noise[0]), pooled(model, noise[1])  # components of one channel share it
 
 
 def _tangent_column(model, recording, dof):

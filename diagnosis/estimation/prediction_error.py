@@ -1,11 +1,8 @@
 """What a corrected simulator predicts: the reported error before, after and at the floor, its
 curve, and traces.
 
-    before = prediction_error(world, {}, recordings, noise)        # nominal
-    after = prediction_error(world, settings, recordings, noise)
-
-The error is the contract's (windows.error): consecutive windows, start as recorded, in units of the
-noise.
+    windows = consecutive(recordings, windowing.HORIZON)
+    before, channels = windowing.error(model, windows, predict(world, {}, windows)[0], noise)
 """
 
 import numpy as np
@@ -26,12 +23,6 @@ def consecutive(recordings, horizon):
     return [w for r in recordings for w in windowing.consecutive(r, horizon, r.start)]
 
 
-def prediction_error(world, settings, recordings, noise):
-    """(error over all channels in noises, {channel: error in SI})."""
-    windows = consecutive(recordings, windowing.HORIZON)
-    return windowing.error(world.model, windows, predict(world, settings, windows)[0], noise)
-
-
 def floor_error(world, settings, smoother, trajectory, noise):
     """The error that a perfect simulator would have, as (all channels in noises, {channel: SI}),
     and how far the square of the former scatters between recordings of the same motion, noise being
@@ -39,57 +30,40 @@ def floor_error(world, settings, smoother, trajectory, noise):
     gap = floor_gaps(world, settings, smoother, trajectory)[:, 1:]
     known = np.isfinite(gap)
     square = np.where(known, gap**2, 0.0)
-    per_channel = {
-        name: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
-        for name, dofs in windowing.channels(world.model).items()
-        if known[..., dofs].any()
-    }
     total, count = (square / noise**2).sum((1, 2)).reshape(DRAWS, -1), max(known.sum(), 1)
-    scatter = (
-        np.sqrt(total.var(axis=0, ddof=1).sum()) * DRAWS / count
-    )  # windows are independent of each other
-    return float(np.sqrt(total.sum() / count)), per_channel, float(scatter)
+    # windows are independent of each other
+    scatter = float(np.sqrt(total.var(axis=0, ddof=1).sum()) * DRAWS / count)
+    per_channel = windowing.by_channel(world.model, square, known)
+    return float(np.sqrt(total.sum() / count)), per_channel, scatter
 
 
 def floor_gaps(world, settings, smoother, trajectory, horizon=windowing.HORIZON):
     """What a perfect simulator would miss in the windows, or some of many: (DRAWS W, T, nv), NaN
-    where nothing was measured.
-
-    The corrected model from smoothed states, from one row before each window on, stands for the
-    truth. It is measured anew, with fresh noise, and predicted from starts as the error defines
-    them: noisy, velocities by differences; DRAWS times, for noise alone makes this vary.
-    """
+    where nothing was measured. The corrected model from smoothed states, from one row before each
+    window on, stands for the truth; it is measured anew and predicted from starts as the error
+    defines them, DRAWS times."""
     rng, model = np.random.default_rng(0), world.model
     windows = sparse(consecutive(smoother.recordings, horizon))
     early = [w._replace(first=max(w.first - 1, 0)) for w in windows]
     truth, speed = predict(world, settings, early, trajectory.at(early))
-    position_noise = smoother.position_noise
-    finite = np.where(np.isfinite(position_noise), position_noise, 0.0)
-    every, at = (
-        np.arange(len(windows)),
-        np.array([w.first - e.first for w, e in zip(windows, early)]),
-    )
+    finite = np.where(np.isfinite(smoother.position_noise), smoother.position_noise, 0.0)
+    every = np.arange(len(windows))
+    at = np.array([w.first - e.first for w, e in zip(windows, early)])
     seconds = np.array(
-        [w.recording.time[w.first + 1] - w.recording.time[e.first] for w, e in zip(windows, early)]
+        [[np.ptp(e.recording.time[[e.first, e.first + k + 1]])] for k, e in zip(at, early)]
     )
     known = windowing.known(model, windows)
     measured = np.array([np.isfinite(w.recording.qvel[w.first]) for w in windows])
     spread, out = _velocity_spread(smoother, trajectory), []
     for _ in range(DRAWS):
-        noisy = windowing.integrate(
-            model, truth, finite * rng.normal(size=truth.shape[:2] + (model.nv,))
-        )
-        start = (
-            windowing.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds[:, None]
-        )
+        noise = finite * rng.normal(size=(*truth.shape[:2], model.nv))
+        noisy = windowing.integrate(model, truth, noise)
+        start = windowing.difference(model, noisy[every, 0], noisy[every, at + 1]) / seconds
         start = np.where(measured, speed[every, at] + spread * rng.normal(size=start.shape), start)
         predicted = predict(world, settings, windows, (noisy[every, at], start))[0]
         rows = np.minimum(np.arange(predicted.shape[1]) + at[:, None], noisy.shape[1] - 1)
-        out.append(
-            np.where(
-                known, windowing.difference(model, predicted, noisy[every[:, None], rows]), np.nan
-            )
-        )
+        gap = windowing.difference(model, predicted, noisy[every[:, None], rows])
+        out.append(np.where(known, gap, np.nan))
     return np.concatenate(out)
 
 
@@ -111,39 +85,27 @@ def reporting_noise(position_noise):
 
 def curve(world, settings, smoother, trajectory, noise, longest=3 * windowing.HORIZON, points=15):
     """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t
-    up to `longest`.
-
-    Windows in which a prediction blew up before t are left out of its error there and counted, with
-    all that were measured then: "blown_up": {"before":, "after":, "of":}, where there are any.
-    """
+    up to `longest`. Windows in which a prediction blew up by then are left out, and counted with
+    all that were measured then: "blown_up": {"before":, "after":, "of":}."""
     windows = consecutive(smoother.recordings, longest)
     seconds = [w.recording.time[w.first : w.last + 1] - w.recording.time[w.first] for w in windows]
     sample = np.median([s[-1] / (len(s) - 1) for s in seconds])
     most = max(1, round(max(s[-1] for s in seconds) / sample))
     known = windowing.known(world.model, windows)
-    predicted = {
-        name: predict(world, s, windows)[0] for name, s in (("before", {}), ("after", settings))
-    }
-    gaps = {
-        name: windowing.position_residual(world.model, windows, qpos)
-        for name, qpos in predicted.items()
-    }
+    miss = lambda qpos: windowing.difference(world.model, qpos, windowing.measured(windows))
+    both = {"before": {}, "after": settings}
+    gaps = {name: miss(predict(world, s, windows)[0]) for name, s in both.items()}
     gaps["floor"] = floor_gaps(world, settings, smoother, trajectory, longest)
     out = []
     for time in sample * np.unique(np.linspace(1, most, min(points, most)).round()):
-        rows = np.array(
-            [_row_at(s, time) for s in seconds]
-        )  # recordings may be sampled at different rates
-        measured_then = _at(known, rows)
+        rows = np.array([_row_at(s, time) for s in seconds])  # recordings may differ in their rates
+        there, then = _at(known, rows), {name: _at(gaps[name], rows) for name in both}
         entry = {"seconds": float(time)}
-        blown = {
-            name: int((measured_then & ~np.isfinite(_at(gaps[name], rows))).any(1).sum())
-            for name in predicted
-        }
-        if any(blown.values()):
-            entry["blown_up"] = {**blown, "of": int(measured_then.any(1).sum())}
+        lost = {k: int((there & ~np.isfinite(gap)).any(1).sum()) for k, gap in then.items()}
+        if any(lost.values()):
+            entry["blown_up"] = {**lost, "of": int(there.any(1).sum())}
         with np.errstate(invalid="ignore", over="ignore"):
-            entry |= {name: _rms(_at(gaps[name], rows) / noise) for name in predicted}
+            entry |= {name: _rms(gap / noise) for name, gap in then.items()}
             entry["floor"] = _rms(_at(gaps["floor"], np.tile(sparse(rows), DRAWS)) / noise)
         out.append(entry)
     return out
@@ -177,33 +139,27 @@ def traces(world, settings, recordings):
     predictions break (NaN) at window starts."""
     out, model = [], world.model
     for recording in recordings[:3]:
-        windows = windowing.consecutive(recording, windowing.HORIZON, recording.start)
-        lines = [_stitched(predict(world, s, windows)[0], windows) for s in ({}, settings)]
+        windows = consecutive([recording], windowing.HORIZON)
+        nominal, corrected = (
+            _stitched(predict(world, s, windows)[0], windows) for s in ({}, settings)
+        )
         rows = np.concatenate([np.arange(w.first, w.last + 1) for w in windows])
         for j, _, q, _ in windowing.joint_slices(model):
             for i in range(q.start, q.stop):
-                if not np.isfinite(recording.qpos[:, i]).any():
-                    continue
-                name = (
-                    "qpos:"
-                    + windowing.joint_name(model, j)
-                    + (f":{i - q.start}" if q.stop - q.start > 1 else "")
-                )
-                out.append(
-                    {
+                if np.isfinite(recording.qpos[:, i]).any():
+                    part = f":{i - q.start}" if q.stop - q.start > 1 else ""
+                    line = {
                         "recording": recording.name,
-                        "channel": name,
+                        "channel": f"qpos:{windowing.joint_name(model, j)}{part}",
                         "time": recording.time[rows],
                         "measured": recording.qpos[rows, i],
-                        "nominal": lines[0][:, i],
-                        "corrected": lines[1][:, i],
+                        "nominal": nominal[:, i],
+                        "corrected": corrected[:, i],
                     }
-                )
+                    out.append(line)
     return out
 
 
 def _stitched(qpos, windows):
-    pieces = [qpos[i, : w.last - w.first + 1].copy() for i, w in enumerate(windows)]
-    for piece in pieces:
-        piece[0] = np.nan
-    return np.concatenate(pieces)
+    qpos[:, 0] = np.nan
+    return np.concatenate([piece[: w.last - w.first + 1] for piece, w in zip(qpos, windows)])

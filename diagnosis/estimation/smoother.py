@@ -16,10 +16,9 @@ import mujoco
 import numpy as np
 
 from diagnosis.estimation import windowing
-from diagnosis.estimation.kalman import smooth
+from diagnosis.estimation.kalman import Response, smooth
 from diagnosis.estimation.noise import measurement_noise
 from diagnosis.estimation.readings import behind, later, shown
-from diagnosis.estimation.response import Response
 from diagnosis.estimation.touching import touching
 from diagnosis.simulation.rows import RowMap
 
@@ -138,12 +137,7 @@ class Smoother:
         nv, out = self.model.nv, np.sqrt(self.R)
         known = np.isfinite(np.concatenate([self.position, self.velocity], 1)).any(0)
         out = np.where(known & self.told, out, np.inf)
-        for dofs in windowing.channels(self.model).values():
-            out[dofs], out[nv + dofs] = (
-                windowing.pooled(out[dofs]),
-                windowing.pooled(out[nv + dofs]),
-            )
-        return out[:nv], out[nv:]
+        return windowing.pooled(self.model, out[:nv]), windowing.pooled(self.model, out[nv:])
 
     def _scale(self):
         """Usual generalized force in each dof (nv,): what holds it and what turns it round in 0.2
@@ -194,7 +188,7 @@ class Smoother:
         transition[~self.last] = step[0][:, : 2 * nv]
         split = np.split(transition, [2 * nv], axis=2)
         args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
-        return Trajectory(*args, Response(found.gains, self.index, self.own, nv))
+        return Trajectory(*args, Response(found.gains, self.index, self.own))
 
     def _seen(self, off):
         """(qpos, qvel, and both as far as they were measured, NaN elsewhere) of the motion behind

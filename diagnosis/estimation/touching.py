@@ -1,8 +1,6 @@
 """Where something touches, as far as positions are known: no smooth map tells of a force there.
 
 free = ~touching(model, qpos, reach)        # (N,)
-
-A reading with noise shows a robot that rests on the ground above it half of the time.
 """
 
 from copy import copy

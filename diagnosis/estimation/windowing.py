@@ -15,13 +15,7 @@ import numpy as np
 from diagnosis.common.coordinates import channels, difference, integrate, joint_name, joint_slices
 from diagnosis.simulation.simulator import Window
 
-__all__ = [
-    "channels",
-    "difference",
-    "integrate",
-    "joint_name",
-    "joint_slices",
-]
+__all__ = ["channels", "difference", "integrate", "joint_name", "joint_slices"]
 
 HORIZON = 0.3  # s, of the error that is reported
 ENDLESS = 1e100  # m or rad: whoever is farther off is nowhere
@@ -51,12 +45,9 @@ def _filled(time, column, default):
 
 
 def states(model, recording):
-    """Recorded states without holes: qpos (T, nq), qvel (T, nv).
-
-    qpos as recorded; qvel as measured, else by central difference. What was never measured is made
-    up: positions
-    by summing measured velocities from the model's qpos0, else qpos0 and rest.
-    """
+    """Recorded states without holes: qpos (T, nq); qvel (T, nv) as measured, else by central
+    difference. What was never measured is made up: positions by summing measured velocities from
+    the model's qpos0, else qpos0 and rest."""
     time = recording.time
     qpos, qvel = np.array(recording.qpos, float), np.array(recording.qvel, float)
     for _, kind, q, v in joint_slices(model):
@@ -84,12 +75,8 @@ def states(model, recording):
 
 
 def consecutive(recording, horizon=HORIZON, first=0, end=None):
-    """Windows of horizon seconds end to end (one's last row is the next one's first); an incomplete
-    last one is dropped.
-
-    first, end: rows of the stretch to cut, end not included. A stretch shorter than the horizon is
-    one window.
-    """
+    """Windows of horizon seconds end to end (one's last row is the next one's first) in rows first
+    to end, that not included; an incomplete last one is dropped, but if there is no other."""
     time, out = recording.time[:end], []
     sample, start = np.median(np.diff(recording.time)), first
     while first < len(time) - 1:
@@ -117,19 +104,12 @@ def recorded_starts(model, windows):
 
 
 def measured(windows, field="qpos"):
-    """The recorded rows of every window, (W, T, n), padded with NaN to the longest."""
-    length = max(w.last - w.first + 1 for w in windows)
-    width = getattr(windows[0].recording, field).shape[1]
-    out = np.full((len(windows), length, width), np.nan)
-    for i, w in enumerate(windows):
-        rows = getattr(w.recording, field)[w.first : w.last + 1]
-        out[i, : len(rows)] = rows
+    """The recorded rows of every window, (W, T, ...), padded with NaN to the longest."""
+    each = [getattr(w.recording, field)[w.first : w.last + 1] for w in windows]
+    out = np.full((len(each), max(map(len, each)), *each[0].shape[1:]), np.nan)
+    for row, rows in zip(out, each):
+        row[: len(rows)] = rows
     return out
-
-
-def position_residual(model, windows, qpos):
-    """measured - predicted in the tangent space, (W, T, nv); NaN where nothing was measured."""
-    return difference(model, qpos, measured(windows))
 
 
 def known(model, windows):
@@ -139,12 +119,9 @@ def known(model, windows):
 
 
 def gaps(model, windows, qpos):
-    """Measured less predicted (W, T - 1, nv), 0 where nothing was measured, and where something
-    was; what the reported error sums.
-
-    Row 0 of a window is the start and does not count. A prediction that blew up counts as infinite.
-    """
-    residual = position_residual(model, windows, qpos)[:, 1:]
+    """Measured less predicted (W, T - 1, nv) after the starts, 0 where nothing was measured and
+    infinite where a prediction blew up, and where something was measured."""
+    residual = difference(model, qpos, measured(windows))[:, 1:]
     there = known(model, windows)[:, 1:]
     return np.where(there, np.where(abs(residual) < ENDLESS, residual, np.inf), 0.0), there
 
@@ -155,22 +132,23 @@ def squares(gap, known, noise):
     return ((gap / noise) ** 2).sum((1, 2)) / max(known.sum(), 1)
 
 
+def by_channel(model, square, known):
+    """{channel: RMS, SI} of squared errors (..., nv), of what is known (..., nv)."""
+    rms = lambda dofs: float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
+    return {name: rms(dofs) for name, dofs in channels(model).items() if known[..., dofs].any()}
+
+
 def error(model, windows, qpos, noise):
-    """The reported error of predictions qpos (W, T, nq): over all channels (in noises), and per
-    channel (SI).
-
-    noise (nv,).
-    """
+    """The reported error of predictions qpos (W, T, nq): over all channels, in noises (nv,), and
+    {channel: SI}."""
     gap, known = gaps(model, windows, qpos)
-    square = gap**2
-    per_channel = {}
-    for name, dofs in channels(model).items():
-        if known[..., dofs].any():
-            per_channel[name] = float(np.sqrt(square[..., dofs].sum() / known[..., dofs].sum()))
-    return float(np.sqrt(squares(gap, known, noise).sum())), per_channel
+    return float(np.sqrt(squares(gap, known, noise).sum())), by_channel(model, gap**2, known)
 
 
-def pooled(noise):
-    """The noise of a channel, from those of its components that moved; inf where none did."""
-    finite = noise[np.isfinite(noise)]
-    return np.sqrt(np.mean(finite**2)) if len(finite) else np.inf
+def pooled(model, noise):
+    """noise (nv,) with that of each channel from its components that moved; inf where none did."""
+    out = np.full_like(noise, np.inf)
+    for dofs in channels(model).values():
+        finite = noise[dofs][np.isfinite(noise[dofs])]
+        out[dofs] = np.sqrt(np.mean(finite**2)) if len(finite) else np.inf
+    return out

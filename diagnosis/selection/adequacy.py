@@ -3,10 +3,8 @@
 shares = share_left(fitted)        # of what the nominal model errs beyond that, in each channel
 for each in lacking(fitted): each.gain, each.p_value      # one Comparison for each channel
 
-A perfect simulator errs too: readings are noisy, so start states are not quite known, and a machine
-may carry such errors far. Windows are drawn as they would be were the set true: begun at states as
-far off as the smoother leaves them, and read with noise. What the set errs in the recordings is
-compared with what it errs in those.
+What it errs in the recordings is compared with what it errs in windows drawn as if it were true:
+begun at states as far off as the smoother leaves them, and read with noise.
 """
 
 import numpy as np

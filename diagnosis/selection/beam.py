@@ -63,17 +63,12 @@ class Beam:
     def nodes_of(self, sets, by=None):
         """The Nodes of some sets of options (those kept included); by: the Evidence that they are
         fitted to, if not that of the motion."""
-        keys = [(by is None, tuple(sorted(options))) for options in sets]
+        evidence, keys = by or self.evidence, [(by is None, tuple(sorted(each))) for each in sets]
         new = {k: tuple(options) for k, options in zip(keys, sets) if k not in self.known}
-        self.known.update(zip(new, self._worked_out(list(new.values()), by or self.evidence)))
+        given = [problem(self.columns, options) for options in new.values()]
+        for key, (index, *_), score in zip(new, given, evidence.scores(given)):
+            self.known[key] = self._node(new[key], index, score, evidence)
         return [self.known[k] for k in keys]
-
-    def _worked_out(self, sets, evidence):
-        given = [problem(self.columns, options) for options in sets]
-        scores = zip(sets, given, evidence.scores(given))
-        return [
-            self._node(options, index, score, evidence) for options, (index, *_), score in scores
-        ]
 
     def _node(self, options, index, score, evidence):
         """The Node of options, of columns index, with a Score by an Evidence."""
@@ -99,8 +94,10 @@ class Beam:
             beam.append(proposed)
             self._reduced(proposed, start, met)
         for _ in range(DEPTH):
-            grown = [new for node in beam for new in self._joined(node, met)]
-            beam = self._different(grown)[:WIDTH]
+            grown, each = [new for node in beam for new in self._joined(node, met)], {}
+            for node in sorted(grown, key=lambda n: n.unpriced):
+                each.setdefault(self._candidates(node), node)
+            beam = list(each.values())[:WIDTH]  # the best of each set of candidates
             for node in beam:
                 self._reduced(node, start, met)
             best = min(node.loss for node in met.values())
@@ -109,11 +106,15 @@ class Beam:
             before = best
         return start, sorted(met.values(), key=lambda n: n.loss)
 
-    def alone(self):
-        """(node of the model as it is, nodes of single options beside it, best first)."""
-        start, met = self.node(self.kept), {}
+    def ranking(self):
+        """[(candidate, loss removed alone, p-value)], most first."""
+        start, met, best = self.node(self.kept), {}, {}
         self._joined(start, met)
-        return start, sorted(met.values(), key=lambda n: n.loss)
+        for node in sorted(met.values(), key=lambda n: n.loss):
+            candidate = self.columns.options[node.options[-1]].candidate
+            p = paired(start.score, node.score).p_value
+            best.setdefault(candidate, (candidate, start.loss - node.loss, p))
+        return list(best.values())
 
     @staticmethod
     def _key(node):
@@ -154,13 +155,6 @@ class Beam:
         """Whether an option is a curve: it leaves so little that what stands beside it would fill
         the beam. The next round looks for that."""
         return isinstance(self.columns.options[k].candidate.effect, Unknown)
-
-    def _different(self, nodes):
-        """The best node of each set of candidates, best first."""
-        best = {}
-        for node in sorted(nodes, key=lambda n: n.unpriced):
-            best.setdefault(self._candidates(node), node)
-        return list(best.values())
 
     def _candidates(self, node):
         return frozenset(self.columns.options[k].candidate for k in node.options)

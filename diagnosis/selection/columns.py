@@ -114,12 +114,9 @@ class Columns:
         rough = self.residual
         if physics and not ahead.same(self.setting):
             rough = ahead.rough([self.setting])[0]
-        changes = iter(
-            self._changes(ahead.rough, rough, physics)
-            + self._changes(ahead.residual, self.residual, steps)
-        )
-        starts = physics + steps
-        for start in starts:
+        changes = self._changes(ahead.rough, rough, physics)
+        changes = iter(changes + self._changes(ahead.residual, self.residual, steps))
+        for start in physics + steps:
             own = [next(changes) for _ in start.directions]
             seen = np.array([self._shows(c) for c in own])
             self._remember(start, seen)
@@ -145,8 +142,7 @@ class Columns:
         return changes
 
     def _remember(self, start, shows):
-        """Keep which parameters of a candidate show at all, so that later columns leave out the
-        others."""
+        """Keep which parameters of a candidate show: later columns leave out the others."""
         single = (start.directions != 0).sum(1) == 1
         # of what is begun at whole values, others may show what these do not
         new = start.candidate not in self.seen and not start.candidate.effect.overrides("probes")
@@ -160,11 +156,7 @@ class Columns:
 
     def secants(self, evidence):
         """Options of single parameters again, with a column at the value that suits each best
-        alone.
-
-        A small step of what sticks, saturates or is late by less than a row says little of a large
-        one.
-        """
+        alone: a small step of what sticks or saturates says little of a large one."""
         moves = lambda o: not o.merges and (o.low < o.high).all()
         single = lambda o: len(o.columns) == 1 and moves(o) and o.candidate not in self.setting
         some = [o for o in self.options if single(o)]

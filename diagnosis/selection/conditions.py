@@ -48,9 +48,8 @@ class Condition:
     def placed(self, world, candidate):
         """An effect that acts only while it holds: a mass that comes is a load."""
         name, place = candidate.effect.name, candidate.place
-        coming = (
-            c for c in world.candidates if c.place == place and name == STEADY.get(c.effect.name)
-        )
+        loads = [c for c in world.candidates if STEADY.get(c.effect.name) == name]
+        coming = (c for c in loads if c.place == place)
         return world.localised(next(coming, candidate), self.when)
 
     def dependence(self, world, trajectory, recordings):

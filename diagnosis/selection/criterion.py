@@ -62,14 +62,9 @@ def complexity(candidates):
 
 
 def paired(before, after):
-    """Comparison of two Scores, differences paired by group.
-
-    What is predicted better by as much everywhere is told by how little the differences scatter (a
-    t-test). What is seen in a few groups alone is told by how much more likely it makes what was
-    left out: by chance a ratio of likelihoods exceeds x in no more than one of x cases. It counts
-    as many errors as are independent. The group that gains most is not counted: one odd window
-    decides nothing.
-    """
+    """Comparison of two Scores, differences paired by group: the lesser p-value of a t-test and of
+    the ratio of likelihoods of independent errors, which by chance exceeds x in one of x cases. In
+    that the group that gains most is not counted: one odd window decides nothing."""
     d = before.groups - after.groups
     n, gain = len(d), float(before.loss - after.loss)
     if n < 2 or not np.isfinite(d).all():  # values that are impossible tell nothing
@@ -82,12 +77,9 @@ def paired(before, after):
 
 
 class Evidence:
-    """Sums of products of the residual (first) and columns per group and cell: everything a
-    hypothesis needs.
-
-    Start states are no part of a hypothesis. Each window's is free within what the smoother knows
-    of it: under every hypothesis it is the likeliest one, given the errors that this leaves.
-    """
+    """Sums of products of the residual (first) and columns per group and cell. Each window's start
+    state is free within what the smoother knows of it: under every hypothesis the likeliest one,
+    given the errors that this leaves."""
 
     def __init__(self, ahead, residual, columns, reference=None):
         """reference (G, cells): mean squared errors of what others are compared with; None takes
@@ -210,11 +202,8 @@ class Evidence:
         return self._scored(self.squares(columns, amounts), amounts)
 
     def score(self, columns, low, high, precision, pull):
-        """Score of a hypothesis.
-
-        columns: indices (p,); low, high (p,): bounds of the amounts; precision, pull (p,): of a
-        quadratic prior, precision/2 amount² - pull amount, in nats.
-        """
+        """Score of columns (p,) between bounds low, high (p,) of their amounts, under a quadratic
+        prior, precision/2 amount² - pull amount (p,), nats."""
         return self.scores([(columns, low, high, precision, pull)])[0]
 
     def scores(self, hypotheses):
@@ -246,11 +235,8 @@ class Evidence:
 
     def _fitted(self, products, prior):
         """(Products, start states free, amounts (B, p), mean squares (B, G, cells)) of the lowest
-        sums of logs.
-
-        That has several minima: in groups where the nominal model happens to do well, a fit that
-        begins at its errors would keep them. So it begins there, and where all groups weigh alike.
-        """
+        sums of logs, of the fits begun at the nominal model's errors, which keeps what that happens
+        to do well, and where all groups weigh alike."""
         precision, pull, low, high = prior
         found = []
         square = products.grouped[..., 0, 0] / np.maximum(self.count, 1)
@@ -277,9 +263,8 @@ class Evidence:
     def weighed(self, square):
         """(G, cells): weights of squares at which least squares lowers the sum of logs, where
         errors are of mean squares (G, cells)."""
-        return np.where(
-            self.count > 0, 1 / (np.maximum(self.count, 1) * (square + self.floor)), 0.0
-        )
+        each = 1 / (np.maximum(self.count, 1) * (square + self.floor))
+        return np.where(self.count > 0, each, 0.0)
 
     def looks(self, columns, amounts, precision):
         """In-sample gain (K,) in nats of each further column beside some at their amounts: a first

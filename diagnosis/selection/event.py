@@ -69,15 +69,13 @@ class Windows:
         """Measured less predicted in noises, (settings, W, rows); 0 where either is missing."""
         model, n = world.model, len(settings)
         moved = np.zeros(2 * model.nv) if moved is None else moved
-        qpos = np.tile(
-            windowing.integrate(model, self.qpos, np.tile(moved[: model.nv], (len(self.qpos), 1))),
-            (n, 1),
-        )
+        qpos = np.tile(windowing.integrate(model, self.qpos, moved[: model.nv]), (n, 1))
         qvel = np.tile(self.qvel + moved[model.nv :], (n, 1))
         each = [s for s in settings for _ in self.windows]
         path = world.simulate(each, qpos, qvel, self.windows * n)[0]
+        path = path.reshape(n, *self.measured.shape)
         with np.errstate(invalid="ignore", over="ignore"):
-            gap = windowing.difference(model, path, np.tile(self.measured, (n, 1, 1))) / self.noise
+            gap = windowing.difference(model, path, self.measured) / self.noise
         return np.where(np.isfinite(gap), gap, 0.0).reshape(n, len(self.windows), -1)
 
     def left(self, settings):
@@ -110,10 +108,8 @@ class Look:
         """All values of the candidate at amounts (k,) of the columns."""
         out = self.base.copy()
         out[self.which] += amounts * self.steps
-        low, high = (
-            np.array([getattr(p, end) for p in self.timed.parameters]) for end in ("low", "high")
-        )
-        return tuple(float(v) for v in np.clip(out, low, high))
+        low, high = zip(*((p.low, p.high) for p in self.timed.parameters))
+        return tuple(np.clip(out, low, high).tolist())
 
 
 class Local:
@@ -143,14 +139,16 @@ class Local:
         when = {"recording": name, "time": [float(t) for t in time]}
         return self.scene.world.localised(look.timed, when)
 
+    def _settings(self, look, time, values):
+        """The setting with an event at a time: at some values, and a step further in each."""
+        candidate, k = self._placed(look, time), len(look.which)
+        rows = np.tile(values, (1 + k, 1))
+        rows[1 + np.arange(k), look.which] += look.steps
+        return [{**self.scene.setting, candidate: tuple(row)} for row in rows]
+
     def _fits(self, look, times, values):
-        """[(left, amounts, Gram matrix)] of an event at several times, linear about some values."""
-        settings = []
-        for time in times:
-            candidate = self._placed(look, time)
-            rows = np.tile(values, (1 + len(look.which), 1))
-            rows[1 + np.arange(len(look.which)), look.which] += look.steps
-            settings += [{**self.scene.setting, candidate: tuple(row)} for row in rows]
+        """[(left, amounts)] of an event at several times, linear about some values."""
+        settings = [s for time in times for s in self._settings(look, time, values)]
         left = self.local.left(settings).reshape(len(times), 1 + len(look.which), -1)
         out = []
         for rows in left:
@@ -179,28 +177,16 @@ class Local:
                 ends, values = trials[best], move(fits[best][1])
         values = move(self._fits(look, [ends], values)[0][1])
         left, half = self._spread(look, ends, values)
-        low, high = (tuple(float(v) for v in np.add(values, sign * half)) for sign in (-1, 1))
-        return Event(
-            self._placed(look, ends),
-            values,
-            self.recording,
-            tuple(float(t) for t in ends),
-            p_value,
-            left=float(self.chi2.sum() - self.around + left),
-            low=low,
-            high=high,
-            removed=float(1 - np.sqrt(left / self.around)),
-        )
+        told = self._placed(look, ends), values, self.recording, tuple(map(float, ends)), p_value
+        rest = float(self.chi2.sum() - self.around + left)
+        bounds = (tuple((values + sign * half).tolist()) for sign in (-1, 1))
+        return Event(*told, rest, *bounds, float(1 - np.sqrt(left / self.around)))
 
     def _spread(self, look, ends, values):
         """(squared residual, half widths (k,) of the values' 95 % intervals, ends being free)."""
-        k, sample = len(look.which), self.sample
-        rows = np.tile(values, (1 + k, 1))
-        rows[1 + np.arange(k), look.which] += look.steps
-        settings = [{**self.scene.setting, self._placed(look, ends): tuple(row)} for row in rows]
+        k, sample, settings = len(look.which), self.sample, self._settings(look, ends, values)
         for shift in ([-sample, 0.0], [0.0, sample]):
-            placed = self._placed(look, np.add(ends, shift))
-            settings.append({**self.scene.setting, placed: tuple(values)})
+            settings += self._settings(look, np.add(ends, shift), values)[:1]
         left = self.local.left(settings).reshape(len(settings), -1)
         columns = (left[:1] - left[1:]).T
         size = np.linalg.norm(columns, axis=0) + 1e-300
@@ -216,15 +202,11 @@ class Local:
         """Whether what acts whenever the motion is like that gains half as much: a force that is
         predicted as far where it was not fitted, or another setting."""
         scene = self.scene
-        every = [
-            {**scene.setting, curve.candidate: curve.values}
-            for curve in curves
-            if "time" not in curve.variables and curve.share >= LASTING
-        ]
-        plain = scene.plain
-        for other in every + ([setting] if setting else []):
-            column = plain - scene.left([other])[0]
-            if (column * plain).sum() ** 2 > LASTING * gain * max((column**2).sum(), 1e-300):
+        some = [c for c in curves if "time" not in c.variables and c.share >= LASTING]
+        every = [{**scene.setting, c.candidate: c.values} for c in some] + [setting or {}]
+        for other in filter(None, every):
+            column = scene.plain - scene.left([other])[0]
+            if (column * scene.plain).sum() ** 2 > LASTING * gain * (column**2).sum() > 0:
                 return True
         return False
 

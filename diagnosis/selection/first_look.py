@@ -2,9 +2,6 @@
 motion.
 
 starts = likely(missing, starts)        # those that are worth a column in every window
-
-What effects do in that part is worked out once for all rounds, where nothing touches. Columns are
-simulated anew in each round.
 """
 
 import numpy as np
@@ -17,14 +14,9 @@ MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; n
 
 
 def likely(missing, starts):
-    """Of Starts, the best ones of those candidates that explain most alone, or beside the best:
-    friction shows in a model with a wrong damping only beside that.
-
-    What acts within a row is asked a row ahead. Effects with states of their own or of the sensors
-    are asked in short windows, as is what changes nothing in the rows, and everything where the
-    motion mostly touches something. Kept are the effects of the setting as well, and waves, which
-    are those most like the located force already.
-    """
+    """Of Starts, the best ones of those candidates that explain most alone, or beside the best, a
+    row ahead, or in short windows where no row tells or the motion mostly touches something. Kept
+    are the effects of the setting as well, and waves, which the located force has chosen."""
     chain, setting = missing.chain, missing.setting
     chosen = lambda start: start.candidate in setting or start.merges
     kept = [start for start in starts if chosen(start)]

@@ -186,7 +186,7 @@ class Identification:
         beam, now = Beam(columns, evidence, missing), judge.fit(setting)
         self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; {now.loss:.3f}")
         if self.judged is None:  # the first look of all
-            self.ranking = self._ranking(beam)
+            self.ranking = beam.ranking()
         judged = self._judged(judge, beam, now)
         if self.judged is None:
             bare = [f for f in judged if f.settled and not physics(f.setting) - set(setting)]
@@ -209,7 +209,11 @@ class Identification:
             for node in sets + alone:
                 new = node.options not in fits
                 if new:
-                    fits[node.options] = self._judge(judge, beam, node, now)
+                    fitted = judge.fit(beam.setting(node), steps=3, near=now)
+                    p, fits[node.options] = paired(now.score, fitted.score).p_value, fitted
+                    losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
+                    limit = "" if fitted.settled else "(limit) "
+                    self.log(f"  {losses} {limit}{said(fitted.setting)}")
                 fitted = fits[node.options]
                 limited = fitted.setting.keys() - fitted.inside.keys()
                 if new and limited & now.setting.keys():
@@ -219,14 +223,6 @@ class Identification:
             else:
                 return [now, *fits.values(), *inside]
             beam.leave(limited)
-
-    def _judge(self, judge, beam, node, now):
-        """The Fitted set of a Node."""
-        fitted = judge.fit(beam.setting(node), steps=3, near=now)
-        p = paired(now.score, fitted.score).p_value
-        losses = f"linear {node.loss:.3f} judged {fitted.loss:.3f} p {p:.2g}"
-        self.log(f"  {losses} {'' if fitted.settled else '(limit) '}{said(fitted.setting)}")
-        return fitted
 
     def _beside(self, judge, judged, now, best):
         """The best set, or the one of an earlier round that is better with what is new; sets that
@@ -352,17 +348,6 @@ class Identification:
         some.sort(key=lambda c: left[c].loss)
         limits = sum(np.isinf(left[c].loss) for c in some)
         return some[: limits + TRIED]
-
-    @staticmethod
-    def _ranking(beam):
-        """[(candidate, loss removed alone, p-value)], most first."""
-        (start, nodes), best = beam.alone(), {}
-        for node in nodes:
-            candidate = beam.columns.options[node.options[-1]].candidate
-            if candidate not in best:
-                p = paired(start.score, node.score).p_value
-                best[candidate] = candidate, start.loss - node.loss, p
-        return list(best.values())
 
 
 def one(candidate):

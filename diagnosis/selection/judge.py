@@ -6,6 +6,7 @@ fitted.setting, fitted.loss
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -66,14 +67,13 @@ class Judge:
         self.seen = {} if seen is None else seen
 
     def fit(self, setting, steps=STEPS, near=None):
-        """The Fitted values of a set of effects, begun at the values given.
-
-        Columns are carried along with steps that do what they told, and simulated again after
-        others, where they lower the loss no more, and at the end: of a set of many effects they are
-        most of the time. near: a Fitted set, whose columns stand for those of the effects that it
-        shares as well, also at the end: enough for a comparison.
-        """
-        inside = {c: self._inside(c, v) for c, v in setting.items()}
+        """The Fitted values of a set of effects, begun at the values given. Columns are carried
+        along with steps that do what they told, and simulated again after others and at the end.
+        near: a Fitted set whose columns stand for those of shared effects, also at the end."""
+        inside = {}
+        for c, v in setting.items():
+            prior = plausible(c, self.usual)
+            inside[c] = tuple(np.clip(v, prior.low, prior.high).tolist())
         columns, carried = self._columns(inside, near=near), near is not None
         while True:
             evidence = columns.evidence(self.reference)
@@ -97,25 +97,21 @@ class Judge:
         return Columns(self.ahead, setting, starts, residual, self.seen, known)
 
     def _better(self, columns, evidence, index, amounts):
-        """((setting, residual) after a step from a setting that its Columns lower the loss with, or
-        None; whether it did so by about as much as they told). amounts (p,): of columns index."""
-        now = evidence.plain()
+        """((setting, residual) after a step that lowers the loss by more than DONE, or None;
+        whether by about as much as columns told): the whole step, or of it and thirds of it the
+        first that is better than the next. amounts (p,): of columns index."""
+        now, each = evidence.plain(), evidence.cells * len(evidence.count)
         told = now - evidence.plain(index, amounts)
         if told <= DONE:
             return None, True
-        now += self._prior(columns.setting, evidence)
-        return self._lower(columns, evidence, amounts, now, told)
-
-    def _lower(self, columns, evidence, amounts, now, told):
-        """((setting, residual) after a step that lowers the loss from what it is now by more than
-        DONE, or None; whether by about as much as told): the whole step, or of it and thirds of it
-        the first that is better than the next."""
+        now += self.cost(columns.setting) / each
         best, most, as_told = None, DONE, False
         for third in range(THIRDS):
             moved = moved_setting(columns, amounts / 3**third)
             if np.isfinite(self.cost(moved)):
                 residual = self.ahead.residual([moved])[0]
-                gained = now - self._whole(residual, moved, evidence)
+                bare = Evidence(self.ahead, residual, np.zeros((*residual.shape, 0)))
+                gained = now - bare.plain() - self.cost(moved) / each
                 if gained > most:
                     best, most = (moved, residual), gained
                     as_told = abs(gained - told) < TRUE * told
@@ -125,23 +121,10 @@ class Judge:
                 break
         return best, as_told
 
-    def _whole(self, residual, setting, evidence):
-        """Loss of a residual with nothing left out, priors included."""
-        plain = Evidence(self.ahead, residual, np.zeros((*residual.shape, 0)))
-        return plain.plain() + self._prior(setting, evidence)
-
-    def _prior(self, setting, evidence):
-        """The cost of a setting's values, as a part of the loss."""
-        return self.cost(setting) / (evidence.cells * len(evidence.count))
-
     def cost(self, setting):
         """Minus the log prior density of a setting's values, nats; infinite where they are not
         possible."""
         return sum(cost(c, v, plausible(c, self.usual)) for c, v in setting.items())
-
-    def _inside(self, candidate, values):
-        prior = plausible(candidate, self.usual)
-        return tuple(float(x) for x in np.clip(values, prior.low, prior.high))
 
 
 def problem(columns, chosen):
@@ -149,18 +132,11 @@ def problem(columns, chosen):
     options = [columns.options[k] for k in chosen]
     if not options:
         return (), *[np.zeros(0)] * 4
-    quadratic = [o.quadratic() for o in options]
-    return (
-        [i for o in options for i in o.columns],
-        np.concatenate([o.low for o in options]),
-        np.concatenate([o.high for o in options]),
-        np.concatenate([p for p, _ in quadratic]),
-        np.concatenate([p for _, p in quadratic]),
-    )
+    parts = zip(*((o.low, o.high, *o.quadratic()) for o in options))
+    return [i for o in options for i in o.columns], *map(np.concatenate, parts)
 
 
-@dataclass(frozen=True)
-class Left:
+class Left(NamedTuple):
     """What is left of a Fitted set in a first look."""
 
     score: Score

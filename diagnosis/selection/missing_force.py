@@ -6,11 +6,10 @@ missing.basis(start)                    # (rows, dofs, p): what a Start holds of
 missing.evidence(starts).at([0], [0.1]) # the criterion's Score of what is lacking beside them
 missing.scores({}, {friction: (0.1,)}) # the Scores of what settings lack
 
-Predictions run from forces to motion, this from motion to forces. Where the forces that a model is
-given are measured, a joint that obeys them less is predicted better, and where a motion is noisy, a
-joint that has less inertia lacks less force: errors in what is given pass for physics in one
-direction, but not in both.
+Errors in what a model is given pass for physics in predictions or in this, but not in both.
 """
+
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -90,7 +89,15 @@ class MissingForce:
     def _evidence(self, every):
         """Of the force and what is held of it (n, nv, 1 + p)."""
         every = every.reshape(GROUPS, len(every) // GROUPS, *every.shape[1:])
-        return Evidence(Rows(every, self), every[..., 0], every[..., 1:])
+        groups = SimpleNamespace(  # as the windows of an Ahead that knows their states
+            known=np.broadcast_to(self.seen, every.shape[:3]),
+            band=np.zeros(every.shape[:2], int),
+            group=np.arange(GROUPS),
+            channels=self.chain.channels,
+            noise=self.noise,
+            freedom=lambda: np.zeros((*every.shape[:3], 0)),
+        )
+        return Evidence(groups, every[..., 0], every[..., 1:])
 
     def scores(self, *settings):
         """[Score] of the force that settings lack, or None where no row tells."""
@@ -105,16 +112,3 @@ class MissingForce:
 def rms(x):
     """Of each column."""
     return np.sqrt(np.mean(x**2, 0))
-
-
-class Rows:
-    """Groups of rows as the windows of an Ahead that knows their states."""
-
-    def __init__(self, values, missing):
-        """values (G, rows, dofs, p)."""
-        self.known = np.broadcast_to(missing.seen, values.shape[:3])
-        self.band, self.group = np.zeros(values.shape[:2], int), np.arange(len(values))
-        self.channels, self.noise = missing.chain.channels, missing.noise
-
-    def freedom(self):
-        return np.zeros((*self.known.shape, 0))

@@ -4,9 +4,6 @@ best for its price first.
 fitted, others = classes(candidates, judge, missing, fitted, begun)
 others[candidate]                                    # [(other, values), ...]
 
-What predicts as well may be a set of other effects too: a gain and a damping are a mass and an
-armature seen from the other side. They are carried from round to round.
-
 earlier = carried(judge, sets, now, best)            # sets of the round before, judged in this one
 sets = as_good(judged + earlier, best)
 others = together(others, fitted, sets)
@@ -162,13 +159,9 @@ def _tied(tried, fitted):
 
 
 def _alike(judge, missing, candidate, pool, held):
-    """[(other, values)] that predict about as well in the candidate's place as far as columns tell,
-    the best first, and of those that are as good the simplest. held: Columns of the set, which
-    stand for those without the candidate.
-
-    Asked at the model without the finding, for what is gone there is what the others have to
-    explain.
-    """
+    """[(other, values)] that predict about as well in the candidate's place as far as columns at
+    the model without it tell, the best first, and of those that are as good the simplest. held:
+    Columns of the set, which stand for those without the candidate."""
     chain, rest = missing.chain, missing.setting
     near = _near(chain.world, candidate, pool) + list(rest)
     starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory).of(near)

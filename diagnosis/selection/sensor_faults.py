@@ -13,8 +13,12 @@ import mujoco
 import numpy as np
 
 from diagnosis.effects.base import SLIDE
-from diagnosis.estimation import groups, prediction_error, windowing
+from diagnosis.estimation import windowing
+from diagnosis.estimation.ahead import neighbours
+from diagnosis.estimation.intervals import one_number
 from diagnosis.estimation.noise import difference_noise
+from diagnosis.estimation.prediction_error import consecutive
+from diagnosis.estimation.readings import behind
 from diagnosis.selection import transients
 from diagnosis.simulation.rows import RowMap
 
@@ -23,6 +27,7 @@ EXPLAINED = 0.8  # of what lies above a sensor's noise, the share that its fault
 LATE = 0.1  # s, of a recording, before which a late sensor would read what was before it
 TURNS = 4  # Gauss-Newton steps of a fault
 SAME = 0.05  # errors closer than this cannot be told apart
+QUATERNIONS = int(mujoco.mjtSensor.mjSENS_BALLQUAT), int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)
 FAULTS = "sensor_bias", "sensor_scale", "sensor_delay"
 MOTION = "rad", "rad/s", "rad/s²", "m", "m/s", "m/s²"
 UNITS = {
@@ -64,101 +69,57 @@ def recorded(model, recordings):
 def unit(model, name):
     """The SI unit of a sensor, "" where it has none or it depends on what it is at."""
     i = model.sensor(name).id
-    kind = mujoco.mjtSensor(model.sensor_type[i])
-    if (
-        kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL)
-        and model.jnt_type[model.sensor_objid[i]] == SLIDE
-    ):
-        return "m" if kind == mujoco.mjtSensor.mjSENS_JOINTPOS else "m/s"
-    return next(
-        (u for u, kinds in UNITS.items() if kind.name.removeprefix("mjSENS_") in kinds.split()), ""
-    )
-
-
-def turns(model, name):
-    """Whether a sensor gives quaternions."""
-    return model.sensor_type[model.sensor(name).id] in (
-        int(mujoco.mjtSensor.mjSENS_BALLQUAT),
-        int(mujoco.mjtSensor.mjSENS_FRAMEQUAT),
-    )
+    kind = mujoco.mjtSensor(model.sensor_type[i]).name.removeprefix("mjSENS_")
+    told = next((u for u, kinds in UNITS.items() if kind in kinds.split()), "")
+    slide = kind in ("JOINTPOS", "JOINTVEL") and model.jnt_type[model.sensor_objid[i]] == SLIDE
+    return told.replace("rad", "m") if slide else told
 
 
 def measured(windows, name, width):
-    """(W, T, width) recorded rows of a sensor; NaN where there are none, and at the last.
-
-    Its control belongs to what follows.
-    """
+    """(W, T, width) recorded rows of a sensor; NaN where there are none, and at the last, whose
+    control belongs to what follows."""
     out = np.full((len(windows), max(w.last - w.first + 1 for w in windows), width), np.nan)
-    for i, w in enumerate(windows):
+    for row, w in zip(out, windows):
         if name in w.recording.sensors:
-            rows = w.recording.sensors[name][w.first : w.last]
-            out[i, : len(rows)] = rows
+            row[: w.last - w.first] = w.recording.sensors[name][w.first : w.last]
     return out
 
 
 def noise_of(recordings, name):
     """Usual noise of a sensor's columns."""
-    return float(
-        np.median(
-            [
-                difference_noise(r.time, column)
-                for r in recordings
-                if name in r.sensors
-                for column in r.sensors[name].T
-            ]
-        )
-    )
+    some = [(r.time, x) for r in recordings if name in r.sensors for x in r.sensors[name].T]
+    return float(np.median([difference_noise(*each) for each in some]))
 
 
 def errors(world, settings, recordings):
-    """{sensor: {"before", "after", "noise": RMS over windows as of the reported error, "unit"}}.
-
-    Infinite where it blows up.
-    """
-    known, windows, out = (
-        recorded(world.model, recordings),
-        prediction_error.consecutive(recordings, windowing.HORIZON),
-        {},
-    )
-    begun = windowing.recorded_starts(world.model, windows) if known else None
-    predicted = (
-        {
-            k: world.simulate([s] * len(windows), *begun, windows, sensors=True)[2]
-            for k, s in (("before", {}), ("after", settings))
-        }
-        if known
-        else {}
-    )
+    """{sensor: {"before", "after", "noise": RMS over windows as of the reported error, "unit"}};
+    infinite where it blows up."""
+    known, out = recorded(world.model, recordings), {}
+    if not known:
+        return out
+    windows = consecutive(recordings, windowing.HORIZON)
+    begun = windowing.recorded_starts(world.model, windows)
+    run = lambda s: world.simulate([s] * len(windows), *begun, windows, sensors=True)[2][:, 1:]
+    predicted = {"before": run({}), "after": run(settings)}
     for name, columns in known:
         seen = measured(windows, name, columns.stop - columns.start)[:, 1:]
-        here = np.isfinite(seen)
-        at_hand = {
-            k: np.where(np.isfinite(p[:, 1:, columns]), p[:, 1:, columns], np.inf)
-            for k, p in predicted.items()
-        }
-        if turns(world.model, name):  # q and -q are the same rotation
-            at_hand = {
-                k: np.where((p * seen).sum(-1, keepdims=True) < 0, -p, p)
-                for k, p in at_hand.items()
-            }
-        gaps = {k: p[here] - seen[here] for k, p in at_hand.items()}
-        if here.any():
-            out[name] = {
-                **{k: float(np.sqrt(np.mean(gap**2))) for k, gap in gaps.items()},
-                "noise": noise_of(recordings, name),
-                "unit": unit(world.model, name),
-            }
+        here, found = np.isfinite(seen), {}
+        if not here.any():
+            continue
+        for k, shown in predicted.items():
+            shown = np.where(np.isfinite(shown[..., columns]), shown[..., columns], np.inf)
+            if world.model.sensor(name).type[0] in QUATERNIONS:  # q and -q are the same rotation
+                shown = np.where((shown * seen).sum(-1, keepdims=True) < 0, -shown, shown)
+            found[k] = float(np.sqrt(np.mean((shown[here] - seen[here]) ** 2)))
+        found |= {"noise": noise_of(recordings, name), "unit": unit(world.model, name)}
+        out[name] = found
     return out
 
 
 def faults(world, settings, train, trajectory, event=None):
     """[finding] for every sensor of which one fault explains nearly all that the motion leaves.
-
-    trajectory: a smoother.Trajectory of the recordings `train` under the settings: its states are
-    right whatever the model lacks, and so are readings worked out of them. event: of the
-    recordings,
-    in whose time nothing is looked for, or None.
-    """
+    trajectory: of the recordings `train` under the settings: its states are right whatever the
+    model lacks. event: in whose time nothing is looked for, or None."""
     known = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION]
     tried, out = _tried(world, settings, known, train, trajectory, event) if known else {}, []
     for name, _ in known:
@@ -182,31 +143,23 @@ def _told(finding):
 def _tried(world, settings, known, recordings, trajectory, event):
     """{(sensor, effect): Tried}, each fault fitted on its own."""
     shown, out = readings(world, settings, recordings, trajectory), {}
-    rows = [
-        np.concatenate([np.arange(a, b) for a, b in transients.quiet(r, event)] or [[]]).astype(int)
-        for r in recordings
-    ]
-    rows = [
-        i[(r.time[i] >= r.time[0] + LATE) & (i < len(r.time) - 1)] for i, r in zip(rows, recordings)
-    ]
-    group = groups.neighbours(sum(map(len, rows)))
+    rows = []
+    for r in recordings:
+        i = np.array([k for a, b in transients.quiet(r, event) for k in range(a, b)], int)
+        rows.append(i[(r.time[i] >= r.time[0] + LATE) & (i < len(r.time) - 1)])
+    group = neighbours(sum(map(len, rows)))
     for name, columns in known:
-        width = columns.stop - columns.start
+        none = np.full((1, columns.stop - columns.start), np.nan)
+        given = zip(recordings, rows)
         target = np.concatenate(
-            [
-                r.sensors.get(name, np.full((len(r.time), width), np.nan))[i]
-                for r, i in zip(recordings, rows)
-            ]
+            [r.sensors[name][i] if name in r.sensors else none.repeat(len(i), 0) for r, i in given]
         )
 
         def predict(measure):
-            offset, ratio, delay = measure
-            late = [
-                np.stack(
-                    [np.interp(r.time[i] - delay, r.time, x) for x in sensors[:, columns].T], 1
-                )
-                for r, i, sensors in zip(recordings, rows, shown)
-            ]
+            (offset, ratio, delay), late = measure, []
+            for r, i, sensors in zip(recordings, rows, shown):
+                at = lambda x: np.interp(r.time[i] - delay, r.time, x)
+                late.append(np.apply_along_axis(at, 0, sensors[:, columns]))
             return ratio * np.concatenate(late) + offset
 
         for effect in FAULTS:
@@ -215,42 +168,27 @@ def _tried(world, settings, known, recordings, trajectory, event):
 
 
 def _fitted(candidate, predict, target, group):
-    """The Tried of a fault at the value that suits it.
-
-    predict(measure): readings (n, k); target (n, k); group (n,).
-    """
+    """The Tried of a fault at the value that suits it. predict(measure): readings (n, k); target
+    (n, k); group (n,)."""
     p, measure = candidate.parameters[0], candidate.effect.measure
-    value, total = p.nominal, lambda x: groups.summed(group, np.where(here, x, 0.0).sum(1))
+    value, total = p.nominal, lambda x: np.bincount(group, np.where(here, x, 0.0).sum(1))
     for _ in range(TURNS):
         now = predict(measure((value,)))
         slope, left = (predict(measure((value + p.step,))) - now) / p.step, target - now
         here = np.isfinite(left + slope)
         gram, score = total(slope**2), total(slope * left)
-        best, value = (
-            value,
-            float(np.clip(value + score.sum() / max(gram.sum(), 1e-300), p.low, p.high)),
-        )
+        best, value = value, value + score.sum() / max(gram.sum(), 1e-300)
+        value = float(np.clip(value, p.low, p.high))
     bare = target - predict(measure((p.nominal,)))
     return Tried(candidate, best, gram, score, total(left**2), total(bare**2), here.sum())
 
 
 def readings(world, settings, recordings, trajectory):
-    """[(T, nsensordata)] of each recording: what sound sensors show along a smoothed motion.
-
-    The located force acts, for accelerations. The last row repeats the one before.
-    """
+    """[(T, nsensordata)] of each recording: what sound sensors show along a smoothed motion under
+    the located force; the last row repeats the one before."""
     rows = RowMap(world, recordings, settings)
-    qpos, qvel, force = (
-        x[rows.begin] for x in (trajectory.qpos, trajectory.qvel, trajectory.force)
-    )
-    for c, values in rows.case.on:
-        if c.place.kind == "joint" and c.effect.overrides(
-            "measure"
-        ):  # what its encoder shows is not so
-            joint = world.model.joint(c.place.name)
-            offset, ratio, _ = c.effect.measure(values)
-            qpos[:, joint.qposadr[0]] = (qpos[:, joint.qposadr[0]] - offset) / ratio
-            qvel[:, joint.dofadr[0]] /= ratio
+    true = behind(world.model, settings, recordings, trajectory.qpos, trajectory.qvel)
+    qpos, qvel, force = (x[rows.begin] for x in (*true, trajectory.force))
     force = np.nan_to_num(force) + rows.forces(np.arange(len(qpos)), qpos, qvel)
     data, out = mujoco.MjData(rows.model), np.empty((len(qpos), world.model.nsensordata))
     for i in range(len(qpos)):
@@ -263,33 +201,22 @@ def readings(world, settings, recordings, trajectory):
 
 
 def finding(model, tried, noise, tests):
-    """The finding of a sensor's fault, or None where it is not sure enough.
-
-    tests: how many faults were tried in all.
-    """
+    """The finding of a sensor's fault, or None where it is not sure enough of so many tests."""
     name, p = tried.candidate.place.name, tried.candidate.parameters[0]
     left, bare = tried.left.sum(), tried.bare.sum()
     if not bare - left > EXPLAINED * max(bare - tried.rows * noise**2, 0.2 * bare):
         return None
     # as seen from the sound sensor, its slope taken as here
-    line = groups.fitted(tried.gram, tried.score + tried.gram * (tried.value - p.nominal))
+    line = one_number(tried.gram, tried.score + tried.gram * (tried.value - p.nominal))
     low, high = tried.value - line.half, tried.value + line.half
     if line.p_value * tests > LEVEL or low <= p.nominal <= high:
         return None
     size = unit(model, name) if p.unit == "sensor" else p.unit
+    value = {"name": p.name, "nominal": float(p.nominal), "value": tried.value, "unit": size}
     return {
         "effect": tried.candidate.effect.name,
         "place": {"kind": "sensor", "name": name},
-        "parameters": [
-            {
-                "name": p.name,
-                "nominal": float(p.nominal),
-                "value": tried.value,
-                "unit": size,
-                "low": max(low, p.low),
-                "high": min(high, p.high),
-            }
-        ],
+        "parameters": [{**value, "low": max(low, p.low), "high": min(high, p.high)}],
         "evidence": {
             "held_out_error_removed": 0.0,
             "sensor_error_removed": float(1 - np.sqrt(left / bare)),

@@ -85,11 +85,11 @@ class Starts:
         else:
             out, whole = [], _begun(candidate, world.probes(candidate, recordings), prior)
         together = candidate.effect.together
-        if together == 1 and len(whole) > PROBES:
+        if together == 1:
             whole = [whole[i] for i in windowing.evenly(len(whole), PROBES)]
-        elif together > 1 and self.trajectory is not None:
-            whole = self._promising(candidate, whole)
         groups = [np.array(whole[k : k + together]) for k in range(0, len(whole), together)]
+        if together > 1 and self.trajectory is not None:
+            groups = self._promising(candidate, groups)
         inside = [rows for rows in groups if all(prior.inside(row) for row in rows)]
         return out + [_full(candidate, base, rows, prior) for rows in inside]
 
@@ -98,15 +98,15 @@ class Starts:
         prior = plausible(candidate, self.usual)
         return _full(candidate, np.zeros(len(values)), np.array([values]), prior)
 
-    def _promising(self, candidate, whole):
-        """Of starts that come in evenly spaced groups, those of the group whose force is most like
-        the located one, moved to where it is even more so."""
-        t, d, together = self.trajectory, self.usual.dof(candidate.place), candidate.effect.together
+    def _promising(self, candidate, groups):
+        """Of evenly spaced groups of starts the one whose force is most like the located one, moved
+        to where it is even more so."""
+        t, d = self.trajectory, self.usual.dof(candidate.place)
         rows = np.flatnonzero(~t.free)
         rows = rows[windowing.evenly(len(rows), STATES)]
         if not len(rows):
-            return whole
-        zero = self._applied(candidate, [0.0, *whole[0][1:]], rows)[:, d]
+            return groups
+        zero = self._applied(candidate, [0.0, *groups[0][0, 1:]], rows)[:, d]
 
         def left(group):
             forces = [self._applied(candidate, tuple(values), rows)[:, d] for values in group]
@@ -114,11 +114,10 @@ class Starts:
             fit = np.linalg.lstsq(basis, t.force[rows, d], rcond=None)[0]
             return np.sum((t.force[rows, d] - basis @ fit) ** 2)
 
-        groups = [np.array(whole[k : k + together]) for k in range(0, len(whole), together)]
         best, step = min(groups, key=left), groups[1] - groups[0]
         for share in NEARER:
             best = min((best, best - share * step, best + share * step), key=left)
-        return [*map(tuple, best)]
+        return [best]
 
     def _applied(self, candidate, values, rows):
         """Generalized forces (n, nv) of actuators and joints with a candidate, dry friction

@@ -4,10 +4,8 @@ event = find(world, recordings, setting, trajectory, noise)   # None, or an Even
 event.candidate, event.values                                 # a localised Candidate
 event.when                                                    # {"recording": name, "time": [a, b]}
 
-Short windows follow each other through every recording, begun at the smoothed states, which are
-free to move: what they explain is projected out. The gain of an effect that acts in windows a..b
-only is that of the sums of its scores and Gram matrices over them, so every interval is tested from
-one simulation per effect; then its ends are moved and its values fitted in the simulator.
+The gain of an effect that acts in short windows a..b only is that of the sums of its scores and
+Gram matrices over them, so every interval is tested from one simulation per effect.
 """
 
 from dataclasses import replace
@@ -16,6 +14,7 @@ import numpy as np
 
 from diagnosis.common.distributions import chi2_ppf, f_sf
 from diagnosis.estimation import windowing
+from diagnosis.estimation.prediction_error import consecutive, reporting_noise
 from diagnosis.selection.criterion import PRICE, complexity
 from diagnosis.selection.event import SPAN, Local, Look, Windows, solved
 from diagnosis.selection.unmodelled_force import dependences
@@ -47,13 +46,12 @@ def find(world, recordings, setting, trajectory, noise, lasting=None):
     trajectory: a smoother.Trajectory under the setting {Candidate: values}; noise (nv,): of the
     positions; lasting: a setting that may explain it as well.
     """
-    windows = [w for r in recordings for w in windowing.consecutive(r, SPAN, r.start)]
+    windows = consecutive(recordings, SPAN)
     number = len(windows)
     if number < 12:
         return None
     first = max(0, min(_loudest(trajectory, windows) - MOST // 2, number - MOST))
-    noise = np.where(np.isfinite(noise), np.maximum(noise, 1e-12), 1.0)
-    scene = Windows(world, setting, windows[first:][:MOST], trajectory, noise)
+    scene = Windows(world, setting, windows[first:][:MOST], trajectory, reporting_noise(noise))
     chi2 = (scene.plain**2).sum(1)
     each = chi2 / scene.rows
     usual = np.median(each)
@@ -65,8 +63,8 @@ def find(world, recordings, setting, trajectory, noise, lasting=None):
     k = len(look.which)
     p = f_sf(gain / k / spread, k, max(number - k, 1)) * number**2 * len(looks)
     ceiling = usual + 4 * (usual - np.quantile(each, 0.16))  # of windows without an event
-    excess = ((each - ceiling).clip(0) * scene.rows).sum()
-    there = ((each - ceiling).clip(0) * scene.rows)[inside].sum()
+    above = (each - ceiling).clip(0) * scene.rows
+    excess, there = above.sum(), above[inside].sum()
     if p > LEVEL or there < CONCENTRATED * excess or not _worth(look, scene, chi2, inside, gain):
         return None
     local = Local(scene, trajectory, chi2, inside)
@@ -100,7 +98,6 @@ def _looks(scene):
     """The Looks of every effect that may come and go: pushes, and changes of a mass."""
     world, setting, out = scene.world, scene.setting, []
     by = {(c.effect.name, c.place): c for c in world.candidates}
-    plain = scene.plain
     for timed in world.candidates:
         name = STEADY.get(timed.effect.name)
         if (name, timed.place) not in by:
@@ -115,18 +112,15 @@ def _looks(scene):
         if which.size:
             columns = columns[..., which]
             start = np.array(timed.nominal, float) if steady is timed else base
-            score = np.einsum("wrk,wr->wk", columns, plain)
+            score = np.einsum("wrk,wr->wk", columns, scene.plain)
             gram = np.einsum("wrk,wrl->wkl", columns, columns)
             out.append(Look(timed, start, steps[which], which, score, gram))
     return out
 
 
 def _interval(look, spans, usual):
-    """(merit, gain, inside, spread, look) of the windows in which an effect gains most.
-
-    merit: the gain less what so many parameters gain of nothing. spread: gain per parameter
-    elsewhere.
-    """
+    """(merit, gain, inside, spread, look) of the windows in which an effect gains most. merit: the
+    gain less what so many parameters gain of nothing; spread: gain per parameter elsewhere."""
     k, found = len(look.which), []
     alone = (solved(look.gram, look.score) * look.score).sum(-1)
     spread = max(usual, np.quantile(alone, 0.3) / chi2_ppf(0.3, k))
@@ -146,14 +140,11 @@ def _interval(look, spans, usual):
 
 
 def _spans(windows):
-    """[(indices of windows in an order, first)]: an event may be the first n of them, n > first.
-
-    Stretches of one recording; and what begins at the same time in every one and goes on, last
-    windows first.
-    """
+    """[(indices of windows in an order, first)]: an event may be the first n of them, n > first, of
+    stretches of one recording, and of what begins in all at the same time and goes on."""
     owner = [w.recording for w in windows]
     most, out = max(1, int(LONGEST * len(windows))), []
-    recordings = list(dict.fromkeys(owner))
+    recordings = windowing.recordings_of(windows)
     for r in recordings:
         mine = np.array([i for i, o in enumerate(owner) if o is r])
         out += [(mine[a : a + most], 0) for a in range(len(mine))]

@@ -16,6 +16,7 @@ ROOT = str(Path(__file__).resolve().parents[2])
 from arm import ARM, run, text
 from contract import contract
 from malformed import cases
+from plants import reported_error
 
 from diagnosis import command as diagnose
 from diagnosis import preparation
@@ -134,9 +135,9 @@ def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
     whole = Recording("run.csv", rows[:, 0], rows[:, 1:2], rows[:, 2:3], rows[:, 3:])
     [early], [tail] = preparation.split([whole])
     world = World(mujoco.MjSpec.from_string(INTEGRATOR))
-    error, _ = prediction_error.prediction_error(world, {}, [tail], np.ones(1))
+    error, _ = reported_error(world, {}, [tail], np.ones(1))
     assert error < 1e-6 and len(prediction_error.consecutive([tail], 0.3)) == 2
-    assert prediction_error.prediction_error(world, {}, [tail.seen()], np.ones(1))[0] > 0.1
+    assert reported_error(world, {}, [tail.seen()], np.ones(1))[0] > 0.1
     (trace,) = prediction_error.traces(world, {}, [tail])
     assert trace["time"][0] == tail.time[tail.start] > early.time[-1]
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from plants import DRIVEN_PENDULUM, NOISE, recorded
+from plants import DRIVEN_PENDULUM, NOISE, recorded, reported_error
 
-from diagnosis.estimation import prediction_error, windowing
+from diagnosis.estimation import windowing
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.handover import Check, Files, accepted
 from diagnosis.simulation.simulator import World
@@ -56,7 +56,7 @@ def test_the_error_of_the_files_is_that_of_the_simulator_that_fitted_them(kept_b
     world, check = kept_back
     setting = {world.candidate("viscous_damping", "pivot"): (0.1,)}
     for some in ({}, setting):
-        own = prediction_error.prediction_error(world, some, check.recordings, check.noise)[0]
+        own = reported_error(world, some, check.recordings, check.noise)[0]
         assert check.error(Files.of(world, some)) == pytest.approx(own, rel=1e-4)
 
 
@@ -69,7 +69,7 @@ def test_files_hold_what_mjcf_cannot_in_a_script():
     check = Check(world, [run], smoother, smoother.position_noise)
     files = Files.of(world, {zone: (0.2,)})
     assert files.forms == {zone: "python"} and files.python
-    own = prediction_error.prediction_error(world, {zone: (0.2,)}, [run], check.noise)[0]
+    own = reported_error(world, {zone: (0.2,)}, [run], check.noise)[0]
     assert check.error(files) == pytest.approx(own, rel=0.02)
     assert np.isfinite(own) and NOISE > 0
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from plants import DRIVEN_PENDULUM, NOISE, recorded
+from plants import DRIVEN_PENDULUM, NOISE, recorded, reported_error
 
 from diagnosis.estimation import prediction_error
 from diagnosis.estimation.smoother import Smoother
@@ -34,7 +34,7 @@ def test_error_is_that_of_stock_mujoco():
     run = recorded("run.csv", 5, mass=0.7)
     xml = DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)
     world = World(mujoco.MjSpec.from_string(xml))
-    error, channels = prediction_error.prediction_error(world, {}, [run], np.array([NOISE]))
+    error, channels = reported_error(world, {}, [run], np.array([NOISE]))
     assert error == pytest.approx(stock_error(xml, run, NOISE), rel=1e-6)
     assert channels["qpos:pivot"] == pytest.approx(error * NOISE, rel=1e-9)
 
@@ -125,5 +125,5 @@ def test_velocities_that_are_late_differences_raise_the_floor_by_their_error():
         trajectory = smoother.locate({})
         noise = np.array([NOISE])
         floors.append(prediction_error.floor_error(world, {}, smoother, trajectory, noise)[0])
-        error, _ = prediction_error.prediction_error(world, {}, [told], noise)
+        error, _ = reported_error(world, {}, [told], noise)
     assert floors[1] == pytest.approx(error, rel=0.2) and floors[0] < 0.8 * error

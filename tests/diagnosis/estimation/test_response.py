@@ -5,8 +5,7 @@ import mujoco
 import numpy as np
 from plants import DRIVEN_PENDULUM, recorded
 
-from diagnosis.estimation.kalman import smooth
-from diagnosis.estimation.response import Response
+from diagnosis.estimation.kalman import Response, smooth
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.simulation.simulator import World
 
@@ -43,7 +42,7 @@ def test_it_is_what_the_smoother_finds_where_the_motion_has_changed_so():
     own = (index < CORE) == [True, False]
     change = rng.normal(size=(2 * ROWS - CORE, m, 3))
     found = smooth(**given)
-    located = Response(found.gains, index, own, DOFS)(change)
+    located = Response(found.gains, index, own)(change)
     for k in range(3):
         moved, y = np.zeros((BLOCKS, 3 * DOFS)), given["y"].copy()
         for t in range(ROWS):

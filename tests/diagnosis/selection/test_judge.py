@@ -165,11 +165,15 @@ def test_what_is_no_equal_is_not_told():
 def test_a_step_is_taken_as_far_as_it_lowers_the_loss(monkeypatch, told, losses, taken, as_told):
     shares, asked = dict(zip((1.0, 1 / 3, 1 / 9), losses)), []
     judge = object.__new__(Judge)
-    judge.ahead = SimpleNamespace(residual=lambda settings: asked.extend(settings) or settings)
+    judge.ahead = SimpleNamespace(
+        residual=lambda settings: asked.extend(settings) or np.array(settings)
+    )
     judge.cost = lambda share: 0.0
-    judge._whole = lambda residual, setting, evidence: shares.get(residual, 0.0)
+    bare = lambda ahead, residual, columns: SimpleNamespace(plain=lambda: shares[float(residual)])
+    monkeypatch.setattr("diagnosis.selection.judge.Evidence", bare)
     monkeypatch.setattr("diagnosis.selection.judge.moved_setting", lambda columns, share: share)
-    found, as_it_did = judge._lower(SimpleNamespace(residual=0.0), None, 1.0, 0.0, told)
+    evidence = SimpleNamespace(plain=lambda *by: -told if by else 0.0, cells=1, count=[0])
+    found, as_it_did = judge._better(SimpleNamespace(setting={}), evidence, [0], 1.0)
     assert (found and found[0]) == taken
     assert as_it_did == as_told
     if as_told:
@@ -213,15 +217,11 @@ def test_columns_are_carried_along_with_steps_that_do_what_they_told(near, turns
     assert asked == simulated
 
 
-@pytest.mark.parametrize("after, asked", [(1.0, [1.0]), (1.9999, [])])
-def test_a_step_is_tried_where_small_changes_tell_of_a_gain(after, asked):
-    judge, plain, told = object.__new__(Judge), iter((2.0, after)), []
-    evidence = SimpleNamespace(plain=lambda *given: next(plain))
-    judge._prior = lambda setting, evidence: 0.0
-    judge._lower = lambda *given: told.append(given[-1]) or ("step", True)
-    better = judge._better(SimpleNamespace(setting={}), evidence, [0], np.ones(1))
-    assert better == (("step", True) if asked else (None, True))
-    assert told == asked
+def test_no_step_is_tried_where_small_changes_tell_of_no_gain():
+    judge, plain = object.__new__(Judge), iter((2.0, 1.9999))
+    evidence = SimpleNamespace(plain=lambda *given: next(plain), cells=1, count=[0])
+    # a step would ask for what this judge does not have
+    assert judge._better(SimpleNamespace(setting={}), evidence, [0], np.ones(1)) == (None, True)
 
 
 def test_a_late_sensor_is_told_beside_a_late_drive():
