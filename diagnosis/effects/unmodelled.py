@@ -131,7 +131,9 @@ class Unknown(JointEffect):
                 "damping",
             )
         elif self.variable == f"position:{joint.name}":  # from where an offset may have moved it
-            zero = spec.copy().compile().joint(joint.name).qpos_spring[0]
+            written = spec.copy().compile().joint(joint.name)
+            by = written.qpos0[0] - model.joint(joint.name).qpos0[0]  # its sensor's bias
+            zero = written.qpos_spring[0] - by
             powers, field = (lambda x: x, lambda x: x**2, lambda x: x**3), "stiffness"
         else:
             return "python"

@@ -18,6 +18,7 @@ from diagnosis.simulation.simulator import step_of
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
 FEWEST = 16  # windows that there should be, if shorter ones make up for it
 MOST = 32  # windows that are simulated, evenly chosen of more
+LEAST = 7  # rows of a window, at least: fewer tell of little but how it began
 GROUPS = 16  # of neighbouring windows, the units that are left out and compared
 FREE = 1.0  # share of what the smoother leaves open of a start state, that a prediction may use
 
@@ -27,7 +28,7 @@ def cut_ahead(recordings, longest=HORIZONS[-1]):
     FEWEST."""
     seconds = [r.time[-1] - r.time[r.start] for r in recordings]
     sample = windowing.sampling(recordings)
-    longest = max(min(longest, sum(seconds) / FEWEST), 12 * sample)
+    longest = max(min(longest, sum(seconds) / FEWEST), LEAST * sample)
     windows = consecutive(recordings, longest)
     return [windows[i] for i in windowing.evenly(len(windows), MOST)]
 

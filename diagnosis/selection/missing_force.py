@@ -110,5 +110,5 @@ class MissingForce:
 
 
 def rms(x):
-    """Of each column."""
+    """Of (n,), or of each column."""
     return np.sqrt(np.mean(x**2, 0))

@@ -14,6 +14,7 @@ from diagnosis.effects.base import HINGE, SLIDE
 from diagnosis.effects.drives import drives_of
 from diagnosis.effects.unmodelled import asked
 from diagnosis.estimation import windowing
+from diagnosis.selection.missing_force import rms
 
 FINE, KNOTS = 33, 9  # places over the range where a curve may bend, and values that it has at most
 BLOCKS = 16  # stretches of time that are left out in turn
@@ -167,11 +168,6 @@ def _clipped(force, size):
 def amounts(basis, force):
     """(k,) of a basis (n, k) that fit a force (n,)."""
     return _solved((basis.T @ basis)[None], (basis.T @ force)[None, :, None])[0, :, 0]
-
-
-def rms(x):
-    """Of (n,)."""
-    return np.sqrt(np.mean(x**2))
 
 
 class Sums:

@@ -24,6 +24,8 @@ def test_windows_are_a_second_long_where_there_are_enough_and_never_too_many():
     assert len(spans) >= 16 and spans == pytest.approx([1.0] * len(spans))
     short = cut_ahead([recorded("short.csv", 0, seconds=4.0)])
     assert 14 <= len(short) <= 18
+    [few] = [recorded("few.csv", 0, seconds=0.4)]
+    assert len(few.time) > 30 and {w.last - w.first for w in cut_ahead([few])[:-1]} == {7}
     assert len(cut_ahead([recorded("hour.csv", 0, seconds=80.0)])) <= 48
     late = cut_ahead([replace(long[0], start=500)])
     assert min(w.first for w in late) == 500

@@ -197,6 +197,19 @@ def test_what_depends_on_the_true_position_does_so_where_its_sensor_is_off(tmp_p
         assert abs(expected - plain).max() > 1e-3, parts
 
 
+def test_a_curve_that_mjcf_holds_is_of_the_true_position_too(tmp_path):
+    """k (q - 0.2) in two knots, of a joint that reads 0.3 rad too much."""
+    world, _ = arm("motors")
+    curve = world.curve("elbow", "position:elbow", (-0.8, 1.2))
+    setting = {curve: (0.5, -0.5), world.candidate("sensor_bias", "elbow"): (0.3,)}
+    recording = record(world)
+    parts, written = script_of(tmp_path, world, setting)
+    assert not parts and written[curve] == "mjcf"
+    expected = simulate(world, [setting], recording, ROWS)[0]
+    qpos = in_script(tmp_path, parts, recording)
+    np.testing.assert_allclose(qpos, expected, rtol=0, atol=0.01)  # 0.16 beside it
+
+
 def test_a_setting_that_mjcf_holds_needs_no_script():
     world, _ = arm("motors")
     setting = {world.candidate("coulomb_friction", "elbow"): (0.1,)}
