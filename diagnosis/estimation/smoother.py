@@ -121,9 +121,7 @@ class Smoother:
         self.own = (rows >= first) & (rows < end)
         self.last = np.zeros(starts[-1], bool)
         self.last[starts[1:] - 1] = True  # of a recording: nothing follows
-        self.before = (
-            np.cumsum(~self.last) - 1
-        )  # row -> its place among the rows that have a next one
+        self.before = np.cumsum(~self.last) - 1  # place among the rows that have a next one
 
     def _floors(self, recordings):
         position, velocity = measurement_noise(self.model, recordings)
@@ -208,9 +206,8 @@ class Smoother:
             A, B = like.transition[now].copy(), like.driven[now].copy()
         n, after = len(q), np.flatnonzero(now) + 1
         with np.errstate(invalid="ignore", over="ignore"):
-            drift = np.concatenate(
-                [windowing.difference(model, qpos[after], q), v - qvel[after]], axis=1
-            ) - np.einsum("nij,nj->ni", B, force[now])
+            moved = windowing.difference(model, qpos[after], q), v - qvel[after]
+            drift = np.concatenate(moved, 1) - np.einsum("nij,nj->ni", B, force[now])
         bad = free[now] | ~np.isfinite(drift).all(1) | ~np.isfinite(A).all((1, 2))
         bad |= ~B.any((1, 2))  # where another one glides
         seconds = rows.seconds[bad]
@@ -247,13 +244,8 @@ class Smoother:
         y = np.where(self.live[..., None], y[self.index], np.nan)
         first = self.index[0]
         start = np.concatenate([offset[first], np.zeros((b, nv))], 1)
-        spread = np.concatenate(
-            [
-                (0.05 * np.std(self.qpos, axis=0).max() + 10 * np.sqrt(self.R[:nv])) ** 2,
-                np.var(self.qvel, axis=0) + 1e-6,
-                self.scale**2,
-            ]
-        )
+        away = (0.05 * np.std(self.qpos, axis=0).max() + 10 * np.sqrt(self.R[:nv])) ** 2
+        spread = np.concatenate([away, np.var(self.qvel, axis=0) + 1e-6, self.scale**2])
         spread = np.tile(spread, (b, 1))
         return smooth(transition, drift, noise, y, self.R, start, spread, apart[self.index])
 

@@ -14,6 +14,7 @@ from diagnosis.effects.bodies import size_of
 from diagnosis.effects.unmodelled import asked
 from diagnosis.estimation import windowing
 
+WAVE = ("waves", np.inf, 1.0, np.inf), ("plain", np.inf, -10, 10)  # its number, its phase
 TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 
 # of each effect: (unit, scale, low, high), one row for all its parameters, or one for each. Units:
@@ -42,11 +43,7 @@ TABLE = {
     "stiffness": [("per travel", 0.5, 0.0, 5.0)],
     "nonlinear_stiffness": [("per travel³", 0.5, -5.0, 5.0)],
     "spring_offset": [("force", 0.5, -2.0, 2.0)],
-    "cogging": [
-        ("force", 0.7, -3.0, 3.0),
-        ("waves", np.inf, 1.0, np.inf),
-        ("plain", np.inf, -10, 10),
-    ],
+    "cogging": [("force", 0.7, -3.0, 3.0), *WAVE],
     "backlash": [("travel", 0.05, 0.0, 0.3)],
     "gain": [("times", 0.25, 0.2, 5.0)],
     "bias": [("force", 0.5, -2.0, 2.0)],  # in a drive on a joint it is a spring_offset
@@ -68,12 +65,7 @@ TABLE = {
     "external_force": [("weight", 0.1, -2.0, 2.0)],
     "link_length": [("times", 0.1, 0.3, 3.0)],
     "load_friction": [("plain", 0.3, 0.0, 0.9), ("plain", 0.3, 0.0, 0.9), ("plain", 0.5, 0.0, 1.0)],
-    "friction_map": [
-        ("force", 0.7, 0.0, 3.0),
-        ("plain", 0.5, 0.0, 1.0),
-        ("waves", np.inf, 1.0, np.inf),
-        ("plain", np.inf, -10, 10),
-    ],
+    "friction_map": [("force", 0.7, 0.0, 3.0), ("plain", 0.5, 0.0, 1.0), *WAVE],
     "servo_stiffness": [("times", 0.25, 0.4, 2.5)],
     "servo_damping": [("times", 0.4, 0.2, 5.0)],
     "coupled_friction": [("force", 0.7, 0.0, 3.0)],
@@ -83,15 +75,7 @@ TABLE = {
     "gain_fade": [("plain", 0.05, 0.0, 0.5)],
     "unknown": [("missing", 3.0, -20.0, 20.0)],
 }
-AWAY = (
-    "gravity",
-    "ground_height",
-    "bias",
-    "spring_offset",
-    "center_of_mass",
-    "external_force",
-    "wind",
-)
+AWAY = "gravity ground_height bias spring_offset center_of_mass external_force wind".split()
 # where the nominal value is zero and "times" says nothing
 NONE = {"servo_damping": "per speed", "contact_friction": "plain"}
 PUSH = 20.0  # times what may last: what acts for a while may be larger

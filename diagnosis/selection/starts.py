@@ -88,19 +88,20 @@ class Starts:
         if together == 1:
             whole = [whole[i] for i in windowing.evenly(len(whole), PROBES)]
         groups = [np.array(whole[k : k + together]) for k in range(0, len(whole), together)]
-        if together > 1 and self.trajectory is not None:
-            groups = self._promising(candidate, groups)
-        inside = [rows for rows in groups if all(prior.inside(row) for row in rows)]
-        return out + [_full(candidate, base, rows, prior) for rows in inside]
+        fits = lambda rows: all(map(prior.inside, rows))
+        groups = [*filter(fits, groups)]
+        if together > 1 and len(groups) > 1 and self.trajectory is not None:
+            groups = self._promising(candidate, groups, fits)
+        return out + [_full(candidate, base, rows, prior) for rows in groups]
 
     def curve(self, candidate, values):
         """The Start of a force without a name at the values that were located."""
         prior = plausible(candidate, self.usual)
         return _full(candidate, np.zeros(len(values)), np.array([values]), prior)
 
-    def _promising(self, candidate, groups):
+    def _promising(self, candidate, groups, fits):
         """Of evenly spaced groups of starts the one whose force is most like the located one, moved
-        to where it is even more so."""
+        to where it is even more so, among those inside what is plausible."""
         t, d = self.trajectory, self.usual.dof(candidate.place)
         rows = np.flatnonzero(~t.free)
         rows = rows[windowing.evenly(len(rows), STATES)]
@@ -116,7 +117,8 @@ class Starts:
 
         best, step = min(groups, key=left), groups[1] - groups[0]
         for share in NEARER:
-            best = min((best, best - share * step, best + share * step), key=left)
+            moved = filter(fits, (best, best - share * step, best + share * step))
+            best = min(moved, key=left)
         return [best]
 
     def _applied(self, candidate, values, rows):

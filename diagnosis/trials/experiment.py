@@ -190,7 +190,8 @@ def _start(system, references, rng, plan):
             qpos[system.address[index]] = wide * rng.uniform(-1, 1)
         if link.range:
             adr = system.address[index]
-            qpos[adr] = np.clip(qpos[adr], 0.9 * link.range[0], 0.9 * link.range[1])
+            low, high = link.range
+            qpos[adr] = np.clip(qpos[adr], low + 0.05 * (high - low), high - 0.05 * (high - low))
     return _above_ground(system, qpos), qvel
 
 

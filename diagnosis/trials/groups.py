@@ -96,13 +96,10 @@ MIMICS = (
     ("joint_elasticity", "delay"),
     ("stiffness", "nonlinear_stiffness"),
     ("spring_offset", "coulomb_friction"),
-    ("gain", "servo_damping"),
     ("mass", "armature"),
     ("backlash", "dead_zone"),
     ("saturation", "gain"),
     ("torque_speed", "back_emf"),
-    ("sensor_delay", "delay"),
-    ("load_friction", "gain"),
     ("sensor_bias", "stiffness"),
 )
 AIR = 1.2  # kg/m^3
@@ -111,6 +108,13 @@ FAMILIES = (  # of which a robot hides one: two would be one law with other valu
     ("coulomb_friction", "stribeck_friction", "presliding", "friction_map"),
     ("mass", "inertia"),
     ("wind", "air_drag"),
+)
+ONE_LAW = (  # of which a joint hides one: the motion shows their sum or product alone
+    ("gain", "load_friction"),
+    ("delay", "sensor_delay"),
+    ("gain", "servo_damping", "servo_stiffness"),
+    ("bias", "spring_offset"),
+    ("viscous_damping", "back_emf", "servo_damping"),
 )
 OF_WORLD = ("gravity", "wind", "air_drag")
 WRONG_AXIS = "wrong_axis"

@@ -98,6 +98,8 @@ def places(robot, effect):
     if effect in OF_DRIVES:
         spots = [s for s in spots if s.actuator >= 0]
     kind = lambda s: robot.actuators[s.actuator].kind
+    if effect == WRONG_AXIS and len(robot.links) == 1:  # as another centre of mass and a rotor
+        return []
     if effect == "servo_stiffness":
         return [s for s in spots if kind(s) == "position"]
     if effect == "servo_damping":

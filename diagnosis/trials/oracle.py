@@ -22,7 +22,7 @@ from diagnosis.trials.truth import TrueSystem
 ENOUGH = 45.0  # noncentral chi² of 3 degrees passes the 1e-4 quantile in 99 % of draws
 AMPLE = 50 * ENOUGH  # left of it after the linear fit: no shorter step will take that away
 HORIZON = 1.0  # s
-COLOURED = 10.0  # rows in the memory of coloured noise: what is seen slowly counts that much less
+COLOURED = 19.0  # (1 + 0.9) / (1 - 0.9), of coloured noise: what is seen slowly counts so much less
 REFITS = 3
 
 

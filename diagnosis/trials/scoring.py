@@ -159,8 +159,19 @@ def names(finding, item):
         return False
     if item["effect"] != "unknown":
         return True
-    told = finding.get("depends_on") or []
-    return len(told) <= MOST_VARIABLES and set(item["needs"]) <= {_plain(t) for t in told}
+    told = {_plain(t) for t in finding.get("depends_on") or []}
+    met = lambda need: any(_says(told, each) for each in need.split("|"))
+    return len(told) <= MOST_VARIABLES and all(map(met, item["needs"]))
+
+
+def _says(told, variable):
+    """Whether variables told hold one: what a drive gives is its control's or its joint's load."""
+    kind, _, place = variable.partition(":")
+    loads = {t for t in told if t.startswith("load:")}
+    same = {
+        t for t in loads if kind == "control" and beside({"name": t}, {"place": {"name": place}})
+    }
+    return variable in told or bool(same)
 
 
 def listed(finding, item):
@@ -217,7 +228,7 @@ def compare_values(item, finding):
     truth = {k: v for k, v in item["parameters"].items() if isinstance(v, int | float)}
     if len(told) == 1 and len(truth) == 1:
         told = {next(iter(truth)): next(iter(told.values()))}
-    if set(truth) in ({"x", "y", "z"}, {"ixx", "iyy", "izz"}):
+    if set(truth) in ({"x", "y", "z"}, {"ixx", "iyy", "izz"}, {"low", "high"}):
         return tuple(_vector_scores(truth, told))
     return tuple(
         _value_score(name, float(value), told.get(name, {}))
@@ -247,19 +258,20 @@ class _Angle(ValueScore):
 
 
 class _Component(ValueScore):
-    """A component of a vector, judged by the vector's length."""
+    """A component of a vector, judged by the vector's length, or an end of a range, by that."""
 
     scale = 0.0
 
     @property
     def near(self):
         if self.value is None or not math.isfinite(self.value):
-            return True  # a component that the recordings do not show may be left out
+            return self.scale > 0  # one that the recordings do not show may be left out, not all
         return abs(self.value - self.truth) <= TOLERANCE * self.scale
 
 
 def _vector_scores(truth, told):
-    scale = math.sqrt(sum(v * v for v in truth.values()))
+    size = truth["high"] - truth["low"] if "high" in truth else math.hypot(*truth.values())
+    scale = size if told else 0.0
     for name, true in truth.items():
         p = told.get(name, {})
         low, value, nominal = p.get("low"), p.get("value"), p.get("nominal")

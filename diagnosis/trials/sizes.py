@@ -276,7 +276,10 @@ def unnamed_law(name, spot, size, robot, usage, rng):
 
 
 def _variable(need, link, robot):
-    """A law's need as the contract's text: "velocity:joint1", "control:drive1", "time"."""
+    """A law's need as the contract's text: "velocity:joint1", "control:drive1", "time"; where
+    either of two will do, with a bar between them."""
+    if "|" in need:
+        return "|".join(_variable(each, link, robot) for each in need.split("|"))
     kind, place = need if isinstance(need, tuple) else (need, link)
     if kind == "time":
         return kind

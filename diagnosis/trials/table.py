@@ -59,8 +59,9 @@ class Task:
 
 def run_trial(task, template, limit=900):
     """Draw a trial, run the tool on it, score what it wrote. Returns a row of the table."""
-    with tempfile.TemporaryDirectory() as parent:
-        folder = Path(task.drawn or Path(parent) / "drawn")
+    # what the tool sees does not lie beside the answer
+    with tempfile.TemporaryDirectory() as parent, tempfile.TemporaryDirectory() as kept:
+        folder = Path(task.drawn or Path(kept) / "drawn")
         if not task.drawn:
             keep(draw_trial(task.key, SETTINGS[task.settings]), folder)
         answer, floor = read_answer(folder)
@@ -112,6 +113,7 @@ def score_columns(score: Score):
     values = [
         {"item": m.item, **asdict(v), "near": v.near, "held": v.held}
         for m in score.matches
+        if m.item in score.needed
         for v in m.values
     ]
     return {

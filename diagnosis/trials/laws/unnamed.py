@@ -79,9 +79,10 @@ class NeighbourSpring(Law):
 
 
 class FluidMemory(Law):
-    """T ẏ = v − y, τ = −d y: fluid dragged along, which keeps moving when the joint stops."""
+    """T ẏ = v − y, τ = −d y: fluid dragged along, which keeps moving when the joint stops. Of slow
+    motion it is a damper, of fast motion a spring."""
 
-    needs = ("velocity",)
+    needs = ("velocity|position",)
 
     def reset(self, s):
         self.state = 0.0

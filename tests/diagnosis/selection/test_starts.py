@@ -86,18 +86,21 @@ def test_what_goes_one_way_is_not_tried_the_other(machine):
     assert count(True) == count(False)
 
 
-def test_a_friction_map_begins_at_the_wave_of_the_located_force(machine):
-    world, usual = machine
-    friction = world.candidate("friction_map", "pivot")
+def rubbing(run, waves):
+    """The Trajectory of a joint whose friction has so many waves per radian."""
     angle = np.linspace(0, 40, 600)
     q, v = 0.8 * np.sin(angle)[:, None], 0.8 * np.cos(angle)[:, None]
-    waves = 9.0
-    travel = np.ptp(np.quantile(usual.recordings[0].qpos, [0.02, 0.98]))
     force = -np.sign(v) * (0.2 + 0.15 * np.sin(waves * q + 1.0))
-    free = np.zeros(len(q), bool)
-    sd, run = np.full(q.shape, 1e-3), usual.recordings[0]
+    free, sd = np.zeros(len(q), bool), np.full(q.shape, 1e-3)
     transition = np.tile(np.eye(2), (len(q), 1, 1))
-    trajectory = Trajectory(q, v, force, sd, sd, sd, {run: 0}, free, transition)
+    return Trajectory(q, v, force, sd, sd, sd, {run: 0}, free, transition)
+
+
+def test_a_friction_map_begins_at_the_wave_of_the_located_force(machine):
+    world, usual = machine
+    friction, waves = world.candidate("friction_map", "pivot"), 9.0
+    travel = np.ptp(np.quantile(usual.recordings[0].qpos, [0.02, 0.98]))
+    trajectory = rubbing(usual.recordings[0], waves)
     starts = Starts(world, {}, usual, trajectory=trajectory).of([friction])
     begun = {start.base[2] + start.directions[0, 2] for start in starts}
     step = (TURNS[1] - TURNS[0]) / travel
@@ -105,6 +108,15 @@ def test_a_friction_map_begins_at_the_wave_of_the_located_force(machine):
     assert all(start.merges and len(start.directions) == 3 for start in starts)
     reach = [start.high[0] * start.directions[0, 0] for start in starts]  # all that is plausible
     assert reach == pytest.approx([plausible(friction, usual).high[0]] * len(starts))
+
+
+def test_a_wave_longer_than_the_travel_is_begun_at_one_that_is_plausible(machine):
+    world, usual = machine
+    friction = world.candidate("friction_map", "pivot")
+    least = plausible(friction, usual).low[2]
+    trajectory = rubbing(usual.recordings[0], 0.7 * least)
+    [start] = Starts(world, {}, usual, trajectory=trajectory).of([friction])
+    assert least <= start.base[2] + start.directions[0, 2] < 1.5 * least
 
 
 def test_a_drives_bias_is_as_plausible_as_the_springs_offset_that_it_equals(machine):

@@ -7,8 +7,8 @@ import pytest
 
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import Window, World
-from diagnosis.trials.drawing import told_item
-from diagnosis.trials.groups import FIELDS, LAWS
+from diagnosis.trials.drawing import Unfit, choose, told_item
+from diagnosis.trials.groups import FIELDS, LAWS, MIMICS, ONE_LAW, WRONG_AXIS
 from diagnosis.trials.hiding import Usage, hide, places
 from diagnosis.trials.robots import FINAL, draw_robot, to_mjcf
 from diagnosis.trials.truth import TrueSystem
@@ -31,6 +31,34 @@ def test_a_pair_of_joints_that_hides_an_effect_can_be_named(effect):
             assert pair in named
             hidden += 1
     assert hidden > 5
+
+
+def test_an_axis_is_wrong_only_where_another_joint_can_tell():
+    """One hinge alone moves alike with another centre of mass and a rotor."""
+    rng, number = np.random.default_rng(0), []
+    for _ in range(30):
+        robot = draw_robot(rng, FINAL)
+        number.append(len(robot.links))
+        assert bool(places(robot, WRONG_AXIS)) == (len(robot.links) > 1)
+    assert min(number) == 1 < max(number)
+
+
+def test_no_joint_hides_two_effects_of_one_law():
+    """gain g and load friction (a, b) act as g (1 - a) and g (1 + b) alone."""
+    for one, other in MIMICS:
+        assert not any(one in family and other in family for family in ONE_LAW)
+    rng, both = np.random.default_rng(0), 0
+    for _ in range(600):
+        try:
+            chosen = choose(rng, "many", draw_robot(rng, FINAL))
+        except Unfit:
+            continue
+        at = {effect: spot.link for effect, spot in chosen}
+        for family in ONE_LAW:
+            links = [at[effect] for effect in family if effect in at]
+            both += len(links) > 1
+            assert len(set(links)) == len(links)
+    assert both  # in two joints they may be
 
 
 def hidden_in(effect, removed, number=2):

@@ -163,6 +163,40 @@ def test_unknown_needs_place_and_variable():
     assert score([item], [finding("unknown", "joint1", depends=["velocity:joint0"])]).found == 0
 
 
+def test_a_force_that_is_either_of_two_variables_is_told_by_one():
+    item = hidden("unknown", needs=["velocity:joint0|position:joint0"], amplitude=1.0)
+    for variable, found in (("velocity", 1), ("position", 1), ("control", 0)):
+        said = finding("unknown", depends=[f"{variable}:joint0"])
+        assert score([item], [said]).found == found
+
+
+def test_what_a_drive_is_asked_for_may_be_told_as_its_joints_load():
+    item = hidden("unknown", needs=["control:drive0"], amplitude=1.0)
+    for variable, found in (("load:joint0", 1), ("load:joint1", 0), ("position:joint0", 0)):
+        assert score([item], [finding("unknown", depends=[variable])]).found == found
+
+
+@pytest.mark.parametrize(
+    "low, high, strict",
+    [
+        ((-0.0093, -0.01, -0.009), (None, None, None), True),  # no recording meets the other side
+        ((-0.0093, -0.01, -0.009), (1.21, 1.2, 1.22), True),
+        ((-0.08, -0.1, -0.07), (1.2, 1.1, 1.3), False),  # 7 % of the range
+    ],
+)
+def test_a_stop_is_right_within_a_twentieth_of_its_range(low, high, strict):
+    item = hidden("joint_stop", low=-0.01, high=1.2)
+    assert score([item], [finding("joint_stop", low=low, high=high)]).strict == strict
+
+
+@pytest.mark.parametrize("effect", ["gravity", "joint_stop"])
+def test_a_name_without_any_value_is_not_right(effect):
+    values = {"x": 0.4, "y": 0.0, "z": -9.8} if effect == "gravity" else {"low": -1.0, "high": 1.0}
+    bare = finding(effect) | {"parameters": []}
+    got = score([hidden(effect, **values)], [bare])
+    assert got.found == 1 and not got.strict
+
+
 def test_unknown_that_depends_on_everything_says_nothing():
     item = hidden("unknown", needs=["velocity:joint0"], amplitude=1.0)
     everything = ["velocity:joint0", "position:joint0", "control:drive0", "time"]

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from diagnosis.trials import laws as L
 from diagnosis.trials.experiment import Plan, record
-from diagnosis.trials.prediction import system_error, windows
+from diagnosis.trials.prediction import model_error, system_error, windows
 from diagnosis.trials.robots import DEVELOPMENT, FINAL, Actuator, Link, Robot, draw_robot, to_mjcf
 from diagnosis.trials.truth import TrueSystem, dry_friction
 
@@ -264,6 +264,26 @@ def test_the_true_system_repeats_its_recording_through_rows_left_out_and_wrong_s
     run = record(system, plan, np.random.default_rng(0))
     assert len(run.time) < 140 and run.touched > 0
     assert system_error(system, [run], np.array([1e-3]), perfect=True) < 1e-9
+
+
+def test_the_floor_knows_no_more_than_a_file_does():
+    """Rows left out and wrong stamps: the machine in stock MuJoCo errs by as much."""
+    robot = pendulum()
+    motor = replace(robot.actuators[0], kp=20.0, kv=2.0)
+    robot = replace(robot, actuators=(motor,), integrator="implicitfast")
+    plan = Plan(0.01, "brisk", "closed", 1e-4, "white", "noisy", "jitter", 0.2, 3.0)
+    system = TrueSystem(robot, [])
+    run, noise = record(system, plan, np.random.default_rng(0)), np.array([1e-4])
+    model = mujoco.MjModel.from_xml_string(to_mjcf(replace(robot, step=2e-4)))
+    floor, stock = system_error(system, [run], noise), model_error(model, model, [run], noise)
+    assert floor == pytest.approx(stock, rel=0.02)
+
+
+def test_a_joint_begins_within_its_range_also_where_that_holds_no_zero():
+    robot = pendulum(range=(-3.6, -1.0))
+    plan = Plan(0.01, "brisk", "open", 1e-4, "white", "none", "regular", 0.0, 0.2)
+    run = record(TrueSystem(robot, []), plan, np.random.default_rng(0))
+    assert -3.6 < run.true_qpos[0, 0] < -1.0
 
 
 def test_a_delay_is_kept_to_the_substep():
