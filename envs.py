@@ -10,8 +10,9 @@ cores. Observations, rewards, ends and resets equal `gymnasium.make(id)`, seed f
 """
 
 import copy
+import importlib.util
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gymnasium
@@ -144,10 +145,29 @@ UNSTABLE = ("QPOS", "QVEL", "QACC", "CTRL")  # MuJoCo's warnings of NaN and huge
 
 
 def task_of(env_id):
-    """The Task of a gymnasium id such as "Hopper-v4". Raises EnvError for any other id."""
+    """The Task of a gymnasium id such as "Hopper-v4", or of a user's file that was loaded. Raises
+    EnvError for any other id."""
     if env_id not in ENV_IDS:
         raise EnvError(f"unknown environment {env_id!r}: choose one of {', '.join(ENV_IDS)}")
-    return TASKS[env_id.split("-")[0]]
+    return TASKS[robot_of(env_id)]
+
+
+def robot_of(env_id):
+    """An id's name in TASKS: what stands before its version; a user's file may have a hyphen."""
+    return env_id if env_id in TASKS else env_id.split("-")[0]
+
+
+def load_task(path):
+    """Make the TASK of a user's file known under the file's name. Returns the name and the file's
+    module; raises whatever the file raises."""
+    path = Path(path)
+    name = path.stem
+    spec = importlib.util.spec_from_file_location(f"task_{name}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    TASKS[name] = replace(module.TASK, xml=str((path.parent / module.TASK.xml).resolve()))
+    ENV_IDS.append(name) if name not in ENV_IDS else None
+    return name, module
 
 
 def model_path(env_id):

@@ -25,7 +25,7 @@ from tqdm import tqdm
 from envs import EnvError
 from training import claims_page
 from training.experiments import EXPERIMENTS, version
-from training.results import JUDGED, ROUNDS, finished, merge, rows_of, write
+from training.results import JUDGED, ROUNDS, finished, merge, read, rows_of, write
 from training.run_folder import RunError
 
 ROOT = Path(__file__).resolve().parent
@@ -131,6 +131,30 @@ def commit():
     return head + "+" * bool(changed)
 
 
+def arms_of(experiments, names):
+    """The arms of experiments, all of them or the named ones. Raises RunError for a name that none
+    of them has."""
+    arms = [arm for name in experiments for arm in EXPERIMENTS[name]]
+    unknown = set(names or ()) - {arm.name for arm in arms}
+    if unknown:
+        known = "; ".join(dict.fromkeys(arm.name for arm in arms))
+        raise RunError(f"--arms: no {', no '.join(map(repr, sorted(unknown)))}: choose of {known}")
+    return [arm for arm in arms if not names or arm.name in names]
+
+
+def table_of(path):
+    """The rows of another machine's table. Raises RunError where there is none."""
+    if not path.is_file():
+        raise RunError(f"--merge: {path} is no file: name a folder with rounds.csv and judged.csv")
+    return read(path)
+
+
+def keep_rows(tables, others):
+    """Put others, rows for each of the tables, into them."""
+    for path, columns, rows in zip(tables, (ROUNDS, JUDGED), merge(tables, others)):
+        write(path, rows, columns)
+
+
 def parse(argv):
     """The parsed command line."""
     parser = argparse.ArgumentParser(
@@ -172,16 +196,10 @@ def main(argv=None):
     tables = args.results / "rounds.csv", args.results / "judged.csv"
     try:
         if args.merge:
-            for path, columns in zip(tables, (ROUNDS, JUDGED)):
-                write(path, merge(path, args.merge / path.name), columns)
+            keep_rows(tables, [table_of(args.merge / path.name) for path in tables])
         failed, waiting = [], []
         if not args.claims and not args.merge:
-            arms = [
-                arm
-                for name in args.experiments or EXPERIMENTS
-                for arm in EXPERIMENTS[name]
-                if not args.arms or arm.name in args.arms
-            ]
+            arms = arms_of(args.experiments or EXPERIMENTS, args.arms)
             name, now = args.commit or commit(), version()
             # seed by seed, so that whenever it stops every arm has the same seeds
             jobs = [
@@ -189,14 +207,13 @@ def main(argv=None):
                 for seed in args.seeds
                 for arm in arms
             ]
-            todo = [job for job in jobs if not finished(tables[0], job, now)]
+            todo = [job for job in jobs if not finished(tables, job, now)]
 
             def keep(job):
-                for path, columns, rows in zip(tables, (ROUNDS, JUDGED), rows_of(job, now, name)):
-                    write(path, merge(path, rows), columns)
+                keep_rows(tables, rows_of(job, now, name))
 
             failed = run_all(todo, args.jobs, time.monotonic() + 60 * args.minutes, keep)
-            waiting = [job for job in todo if not finished(tables[0], job, now)]
+            waiting = [job for job in todo if not finished(tables, job, now)]
             print(f"{len(jobs) - len(waiting)} of {len(jobs)} runs are in {tables[0]}")
         claims_page.report(args.results)
         return 1 if failed or waiting else 0

@@ -23,7 +23,7 @@ from gymnasium.vector.utils import batch_space
 from mujoco.batch import Batch
 
 from diagnosis.simulation.corrected_py import CorrectedBatch, parts_in
-from envs import BatchEnv, EnvError
+from envs import BatchEnv, EnvError, load_task
 from models import (
     ForwardModel,
     GaussianPolicy,
@@ -584,13 +584,20 @@ def grounded_env(run, num_envs=1, step=None):
     train any policy in.
 
     run: the run's folder. step: the grounding step that it is of, the last one by default.
-    Raises EnvError for a folder without that step, and for a run of the oracle.
+    Raises EnvError for a folder without that step, for a run of the oracle, and where the file of
+    a user's task is no longer what it was.
     """
-    steps = sorted(Path(run).glob("step_*.pt"))[1:]
+    number = lambda path: int(path.stem.removeprefix("step_"))  # as text 100 is before 11
+    steps = sorted(Path(run).glob("step_*.pt"), key=number)[1:]
     if not 0 < (len(steps) if step is None else step) <= len(steps):
         raise EnvError(f"{run} has no grounding step {step or 1}: it has done {len(steps)}")
     saved = load_checkpoint(steps[-1 if step is None else step - 1])
     world, state = saved["world"], saved["grounding"]
+    if world.get("task"):
+        try:
+            load_task(world["task"])
+        except Exception as error:  # whatever a user's file raises
+            raise EnvError(f"{run}: its --task {world['task']} fails: {error!r}") from None
     xml, script = state.get("corrected_xml"), state.get("corrected_py", "")
     if xml:
         sim = CorrectedEnv(world["env"], num_envs, xml, script)

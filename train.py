@@ -159,7 +159,12 @@ def record(s, run, step, learner, grounding, real, tau_new, stats, bar):
             "grounding": transformer,
             "acting": acting,
             "recordings": real.seen if s.real_data else [],
-            "world": {"env": s.env, "algo": s.algo, "settings": transforming(s.grounding)},
+            "world": {
+                "env": s.env,
+                "task": str(Path(s.task).resolve()) if s.task else "",
+                "algo": s.algo,
+                "settings": transforming(s.grounding),
+            },
         },
         tau_new,
     )
@@ -235,7 +240,7 @@ def start(s, run, sim, real, bar):
         bar.skip(int(run.progress[-1]["real_transitions" if s.algo == "real" else "sim_steps"]))
         if not run.lines:
             reference(s, run, learner, real, bar)
-        elif s.algo != "real":
+        elif s.algo != "real" or s.policy_from:
             bar.skip(s.reference_steps, counts=False)
         bar.lap()
         return learner, grounding, tau_real
@@ -254,7 +259,7 @@ def reference(s, run, learner, real, bar):
     """The green line: the return on real of a policy trained there, for --reference-steps."""
     if s.real_data:
         return
-    if s.algo != "real":
+    if s.algo != "real" or s.policy_from:  # a given policy is no line: it was not trained there
         learner = new_learner(s)
         learner.load(pretrained(s, "real", real, s.reference_steps, bar))
     seed = seed_for(s.seed, 0, "evaluate")
@@ -331,9 +336,10 @@ def pretrained(s, world, env, steps, bar):
     folder = Path(s.pretrained) if s.pretrained else bar.run.folder
     path = folder / f"{s.env}-{world}-{key}.pt"
     learner = new_learner(s)
+    own = world == bar.world and not s.policy_from  # not of a reference line
     if path.exists():
         whole = learner.batch_steps(env)
-        bar.skip(-(-steps // whole) * whole, counts=world == bar.world)
+        bar.skip(-(-steps // whole) * whole, counts=own)
         try:
             learner.load(load_checkpoint(path))
         except UNSOUND:
@@ -345,7 +351,7 @@ def pretrained(s, world, env, steps, bar):
         raise RunError(
             f"cannot make the folder {folder}: {error.strerror}; choose another --pretrained"
         ) from None
-    name = "pretrain" if world == bar.world else "reference"
+    name = "pretrain" if own else "reference"
     bar.run.train = [
         row for row in bar.run.train if row["phase"] != name
     ]  # what a cut-off attempt left
@@ -478,7 +484,7 @@ def resumed(folder, grounding_steps=None):
     """A run of this version, and its settings up to as many steps (None: as it began with)."""
     run, saved = Run.open(folder)
     s = settings_of(folder, saved)
-    run.require_this_version()
+    run.require_this_version(dataclasses.asdict(s))
     if grounding_steps is not None:
         if grounding_steps < len(run.progress) - 1:
             raise RunError(

@@ -14,7 +14,8 @@ import reproduce
 from diagnosis.common.atomic_files import write_table
 from training import claims, claims_page
 from training.experiments import EXPERIMENTS, Arm, version
-from training.results import KEY, PROGRESS, finished, merge, read, rows_of, write
+from training.measured import Data, by_experiment
+from training.results import JUDGED, PROGRESS, ROUNDS, finished, merge, read, rows_of, write
 from training.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,15 +59,20 @@ def test_every_experiment_can_be_asked_of_train(tmp_path):
 
 
 def test_a_row_of_other_settings_or_of_another_version_is_not_taken_for_this_runs(tmp_path):
-    path, now = tmp_path / "rounds.csv", "v1"
+    path, now = (tmp_path / "rounds.csv", tmp_path / "judged.csv"), "v1"
     job = reproduce.Job(arm(), 0, 2, tmp_path / "runs")
     assert not finished(path, job, now)
     fill(job, 1)
-    write(path, rows_of(job, now, "abc")[0], [*KEY, *PROGRESS])
+    reproduce.keep_rows(path, rows_of(job, now, "abc"))
     assert not finished(path, job, now)  # one of two steps
     fill(job, 2)
-    write(path, merge(path, rows_of(job, now, "abc")[0]), [*KEY, *PROGRESS])
-    assert len(read(path)) == 3 and finished(path, job, now)
+    rounds, judged = rows_of(job, now, "abc")
+    assert len(merge(path, (rounds, []))[0]) == 3
+    write(path[0], rounds, ROUNDS)
+    write(path[1], [], JUDGED)
+    assert not finished(path, job, now)  # not judged: a run that was cut off before its verdict
+    reproduce.keep_rows(path, (rounds, judged))
+    assert len(read(path[0])) == 3 and finished(path, job, now)
     assert not finished(path, job, "v2")
     assert not finished(path, reproduce.Job(arm(), 0, 20, tmp_path), now)
     assert not finished(path, reproduce.Job(arm(), 1, 2, tmp_path), now)
@@ -83,16 +89,30 @@ def test_a_folder_that_is_there_goes_on_and_is_asked_for_more_steps(tmp_path):
     assert job.command() == ["--resume", str(job.folder), "--grounding-steps", "20"]
 
 
-def test_merged_tables_keep_the_run_that_went_further(tmp_path):
-    tables = []
+def test_merged_tables_keep_the_run_that_went_further_and_its_verdict(tmp_path):
+    sides = []
     for name, steps in (("a", 1), ("b", 2)):
         job = reproduce.Job(arm(), 0, 2, tmp_path / name)
         fill(job, steps, value=10.0 * steps)
-        tables.append(tmp_path / name / "rounds.csv")
-        write(tables[-1], rows_of(job, "v1", "abc")[0], [*KEY, *PROGRESS])
-    for one, other in itertools.permutations(tables):
-        values = [float(row["real_return_deterministic"]) for row in merge(one, other)]
+        sides.append([tmp_path / name / f"{table}.csv" for table in ("rounds", "judged")])
+        reproduce.keep_rows(sides[-1], rows_of(job, "v1", "abc"))
+    for one, other in itertools.permutations(sides):
+        rounds, judged = merge(one, [read(path) for path in other])
+        values = [float(row["real_return_deterministic"]) for row in rounds]
         assert sorted(values) == [20.0, 21.0, 22.0]
+        assert [row["real_return_deterministic"] for row in judged] == ["20.0"]
+
+
+def test_what_cannot_be_met_is_told_in_one_line(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    for told, says in (
+        (["--arms", "rgat", "no such"], "'no such'"),
+        (["--merge", str(tmp_path / "empty")], "rounds.csv"),
+    ):
+        folders = ["--results", str(tmp_path), "--runs", str(tmp_path)]
+        assert reproduce.main([*told, "--minutes", "0", *folders]) == 2
+        [line] = capsys.readouterr().err.splitlines()
+        assert says in line
 
 
 def test_one_job_trains_what_others_begin_with_and_none_is_lost(tmp_path, monkeypatch):
@@ -183,9 +203,10 @@ def test_verdicts():
     assert claims.verdict(-1.0, 1.0, 2) == claims.verdict(5.0, 0.01, 2) == "undecided"
 
 
-def row(arm, seed, step, value, v="v1", error=""):
+def row(arm, seed, step, value, v="v1", error="", env="Hopper-v4"):
     told = {
         "experiment": "hopper",
+        "env": env,
         "settings": "s",
         "arm": arm,
         "seed": seed,
@@ -199,11 +220,68 @@ def row(arm, seed, step, value, v="v1", error=""):
 def test_pairs_are_of_seeds_that_both_have_over_rounds_that_both_have():
     rounds = [row("rgat", s, k, 10 * s + k) for s in (0, 1, 2) for k in range(4)]
     rounds += [row("gat", s, k, 10 * s - k) for s in (1, 2, 3) for k in range(3)]
-    data = claims.Data(rounds, [{"arm": "rgat", "seed": 1, "trained_on_real": 10}])
-    np.testing.assert_allclose(claims.above("rgat", "gat")(data), [3.0, 3.0])  # 2 * mean(1, 2)
-    np.testing.assert_allclose(claims.reaches("rgat")(data), [(13 - 9) / 10])
-    np.testing.assert_allclose(claims.reaches("rgat", 1)(data), [(11 - 9) / 10])
-    np.testing.assert_allclose(claims.falls_short("rgat")(data), [-0.4])
+    data = Data(rounds, [{"arm": "rgat", "seed": 1, "trained_on_real": 10}])
+    for claim, values, after in (
+        (claims.above("rgat", "gat"), [3.0, 3.0], 2),  # 2 * mean(1, 2)
+        (claims.reaches("rgat"), [(13 - 9) / 10], 3),
+        (claims.reaches("rgat", 1), [(11 - 9) / 10], 1),
+        (claims.falls_short("rgat"), [-0.4], 3),
+    ):
+        got, rounds_of_it = claim(data)
+        np.testing.assert_allclose(got, values)
+        assert rounds_of_it == after
+
+
+def test_seeds_that_begin_with_other_policies_are_not_compared():
+    rounds = [row(arm, s, k, 10 * k) for arm in ("solved", "rgat") for s in (0, 1) for k in (0, 1)]
+    rounds[0]["real_return_deterministic"] = 7.0  # of solved, seed 0, before grounding
+    values, after = claims.above("solved", "rgat")(Data(rounds, []))
+    assert values.tolist() == [0.0] and after == 1
+
+
+def test_precision_is_compared_among_methods_of_one_learner_policy_and_number_of_rounds():
+    rising = [(0.0, 9.0), (1.0, 3.0), (2.0, 2.0), (3.0, 1.0)]  # return, error: they agree
+    arms = {
+        "rgat": rising,
+        "gat": rising,
+        "solved": rising[:2],  # fewer rounds
+        "sim": [(9.0, 9.0), *rising[:0:-1]],  # another policy, and an order that would not agree
+        "ane 0.4": [rising[0], (5.0, 9.0), (6.0, 9.5), (7.0, 9.7)],
+        "rgat as printed": [(0.0, 9.0)] + 10 * [(8.0, 9.9)],
+    }
+    rounds = [
+        row(arm, seed, k, value, error=error)
+        for arm, run in arms.items()
+        for seed in (0, 1)
+        for k, (value, error) in enumerate(run)
+    ]
+    values, after = claims.precision_explains(Data(rounds, []))
+    np.testing.assert_allclose(values, [1.0, 1.0])
+    assert after == 3
+
+
+def test_a_line_is_that_of_one_task_and_of_the_arm_with_most_seeds():
+    line = lambda arm, seed: {"arm": arm, "seed": seed, "trained_on_real": seed}
+    ended = [line("few", 0), line("many", 1), line("many", 2)]
+    one = [row(r["arm"], r["seed"], 0, 1.0) for r in ended]
+    assert Data(one, ended).line().tolist() == [1, 2]
+    two = [*one[:2], row("many", 2, 0, 1.0, env="HalfCheetah-v4")]
+    assert not len(Data(two, ended).line())
+    assert "trained on real" not in claims_page.rounds_of("x", Data(two, ended))
+
+
+def test_capacity_is_a_claim_of_each_task():
+    rounds = [
+        row(f"{env}, {policy}", 0, 0, value, env=env)
+        for env, shallow in (("Hopper-v4", 1.0), ("HalfCheetah-v4", 9.0))
+        for policy, value in (("shallow", shallow), ("deep", 4.0))
+    ]
+    made = claims.table(
+        [{**r, "experiment": "capacity"} for r in rounds],
+        [{**r, "experiment": "capacity", "trained_on_real": 1.0} for r in rounds],
+        [],
+    )
+    assert [float(r["value"]) for r in made] == [0.25, -1.75]
 
 
 def test_versions_are_never_put_together():
@@ -211,10 +289,10 @@ def test_versions_are_never_put_together():
         row("rgat", s, 0, 5.0, "v2") for s in range(9)
     ]
     ended = [{**r, "trained_on_real": 7.0 + (r["version"] == "v2")} for r in rounds]
-    data = claims.by_experiment(rounds, ended)["hopper"]
+    data = by_experiment(rounds, ended)["hopper"]
     assert data.version == "v2" and len(data.returns["rgat"]) == 9
     assert set(data.line()) == {8.0}
-    data = claims.by_experiment(rounds, ended[:4])["hopper"]  # what has not ended does not count
+    data = by_experiment(rounds, ended[:4])["hopper"]  # what has not ended does not count
     assert data.version == "v1" and len(data.returns["rgat"]) == 3
 
 

@@ -335,7 +335,7 @@ def test_a_saved_policy_keeps_its_robots_bounds(finished):
 
 def test_a_run_begins_with_the_policy_of_a_file(finished, tmp_path, capfd):
     given = finished("rgat") / "policy.pt"
-    told = ["--policy-from", str(given), "--grounding-steps", "1"]
+    told = ["--policy-from", str(given), "--grounding-steps", "1", "--reference-steps", "4000"]
     assert train.main(command(tmp_path / "run", "rgat", ENV, *told)) == 0
     first = torch.load(tmp_path / "run" / "step_00.pt", weights_only=True)
     theirs = torch.load(given, weights_only=True)["state"]
@@ -348,6 +348,19 @@ def test_a_run_begins_with_the_policy_of_a_file(finished, tmp_path, capfd):
     refused(command(tmp_path / "b", "rgat", ENV, "--policy-from", "none.pt"), capfd, "none.pt")
     told = ["--policy-from", str(given), "--policy", "shallow"]
     refused(command(tmp_path / "c", "rgat", ENV, *told), capfd, "--policy", "(4, 64, 64, 1)")
+
+
+def test_the_line_beside_a_given_policy_is_trained_on_real_for_as_long_as_ever(finished, tmp_path):
+    given = str(finished("rgat") / "policy.pt")
+    s = train.Settings(env=ENV, policy_from=given, pretrain_steps=7).completed()
+    assert s.reference_steps == train.Settings(env=ENV).completed().reference_steps
+    told = ["--policy-from", given, "--grounding-steps", "0", "--reference-steps", "4000"]
+    assert train.main(command(tmp_path / "run", "real", ENV, *told)) == 0
+    theirs = json.loads((finished("rgat") / "lines.json").read_text())
+    assert json.loads((tmp_path / "run" / "lines.json").read_text()) == theirs
+    [row] = table(tmp_path / "run" / "progress.csv")  # the critic's steps, not the line's
+    rows = [r for r in table(tmp_path / "run" / "train.csv") if r["phase"] == "critic"]
+    assert row["real_transitions"] == rows[-1]["steps"]
 
 
 def test_tensorboard_on_request(tmp_path, capfd, monkeypatch):

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from diagnosis.common.atomic_files import write_table, write_whole
-from training.claims import COLUMNS, by_experiment, table
+from training.claims import COLUMNS, table
+from training.measured import by_experiment
 from training.results import read
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "results.md"
@@ -54,8 +55,11 @@ def filled(text, rounds, judged, transformers, claims):
 
 def claims_markdown(claims):
     """The rows of claims.csv as a table."""
-    header = "claim|figure|value|95 % interval|seeds|p, corrected|verdict|version"
-    row = "{claim}|{figure}|{value}|{low} to {high}|{seeds}|{p_corrected}|**{verdict}**|{version}"
+    header = "claim|figure|rounds|value|95 % interval|seeds|p, corrected|verdict|version"
+    row = (
+        "{claim}|{figure}|{rounds}|{value}|{low} to {high}|{seeds}|{p_corrected}|**{verdict}**|"
+        "{version}"
+    )
     told = lambda cell: (
         "–" if cell in ("nan", "nan to nan") else cell
     )  # of fewer seeds than it asks

@@ -13,6 +13,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from diagnosis.recordings.columns import columns_of
 from diagnosis.recordings.recording import RecordingError, load
 from training.run_folder import RunError
 from trpo import Transitions
@@ -25,7 +26,8 @@ class RealData:
 
     Args: folder: of recordings, in the diagnosis' formats, of the sim's joints and actuators.
     sim: the BatchEnv whose observations they become. seen: names that earlier grounding steps used.
-    Raises RunError: no recordings, those of another robot, or of another control period.
+    Raises RunError: no recordings, those of another robot, or of another control period, or too few
+    rows that hold all that the task observes.
     """
 
     def __init__(self, folder, sim, seen=()):
@@ -38,10 +40,29 @@ class RealData:
         except RecordingError as error:
             raise RunError(f"--real-data {folder}: {error}") from None
         self.parts = {r.name: self._split(self._transitions(r)) for r in recordings}
+        if not len(self.held_out()):
+            raise RunError(f"--real-data {folder}: {self._lacking(recordings)}")
 
     def _split(self, transitions):
         cut = len(transitions) - len(transitions) // 5
         return transitions[:cut], transitions[cut:]
+
+    def _lacking(self, recordings):
+        """Why there are no rows to judge by, in words."""
+        rows = sum(len(learnt) for learnt, _ in self.parts.values())
+        if rows:
+            return (
+                f"{rows} usable rows, and none to judge by, the last fifth of a recording: record "
+                "at least 6 rows at a time"
+            )
+        never = [
+            name
+            for name, (kind, k) in columns_of(self.sim.model).items()
+            if kind == "qpos" and all(np.isnan(r.qpos[:, k]).all() for r in recordings)
+        ]
+        if never:
+            return f"never measured: {', '.join(never)}; a task needs every joint"
+        return "no two rows in succession hold every joint: fill the gaps"
 
     def _transitions(self, recording):
         """One recording at the task's control period, without rows that lack something."""

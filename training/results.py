@@ -44,22 +44,24 @@ def write(path, rows, columns):
     write_table(path, columns, sorted(rows, key=order))
 
 
-def merge(path, others):
-    """The rows of a CSV and of another (or of a list): of a run that both
-    hold, the ones that went further."""
+def merge(tables, others):
+    """The rows of two CSVs, rounds and judged, and of two others (lists of rows): of a run that
+    both hold, those of the side that went further in rounds, of equal ones the judged side."""
     found = {}
-    for rows in (read(path), others if isinstance(others, list) else read(others)):
+    for rounds, judged in (map(read, tables), others):
         runs = {}
-        for row in rows:
-            runs.setdefault(tuple(str(row[k]) for k in SAME), []).append(row)
+        for table, rows in enumerate((rounds, judged)):
+            for row in rows:
+                run = tuple(str(row[k]) for k in SAME)
+                runs.setdefault(run, ([], []))[table].append(row)
         for key, run in runs.items():
-            if len(run) >= len(found.get(key, ())):
+            if key not in found or [len(rows) for rows in run] >= [len(r) for r in found[key]]:
                 found[key] = run
-    return [row for run in found.values() for row in run]
+    return tuple([row for run in found.values() for row in run[table]] for table in (0, 1))
 
 
-def finished(path, job, version):
-    """Whether a CSV holds every grounding step of a job."""
+def finished(tables, job, version):
+    """Whether two CSVs, rounds and judged, hold every grounding step of a job and its verdict."""
     key = {
         "experiment": job.arm.experiment,
         "arm": job.arm.name,
@@ -67,8 +69,10 @@ def finished(path, job, version):
         "version": version,
         "seed": str(job.seed),
     }
-    mine = [row for row in read(path) if all(row[k] == v for k, v in key.items())]
-    return any(int(row["grounding_step"]) >= job.steps for row in mine)
+    rounds, judged = (
+        [row for row in read(path) if all(row[k] == v for k, v in key.items())] for path in tables
+    )
+    return bool(judged) and any(int(row["grounding_step"]) >= job.steps for row in rounds)
 
 
 def rows_of(job, version, commit):

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from diagnosis.common.atomic_files import write_table, write_whole
+from envs import model_path
 from models import GaussianPolicy, load_checkpoint
 from training.replay import animate as animate  # for train.py
 
@@ -54,8 +55,20 @@ def save_whole(path, tensors):
     write_whole(path, data.getvalue())
 
 
-def versions():
-    """What the numbers of a run depend on besides its settings."""
+def versions(settings=None):
+    """What the numbers of a run depend on besides its settings (a dict; None: no run's).
+
+    That is the diagnosis' code too where it grounds, and of a user's task its file and its model.
+    """
+    settings = settings or {}
+    root, used = Path(__file__).parents[1], {}
+    if settings.get("algo", "").startswith("physics"):
+        paths = sorted((root / "diagnosis").rglob("*.py"))
+        used["diagnosis"] = code_version(*(p.relative_to(root).with_suffix("") for p in paths))
+    if settings.get("task"):
+        files = Path(settings["task"]), model_path(settings["env"])
+        texts = b"\n".join(path.read_bytes() for path in files)
+        used["task"] = hashlib.sha256(texts).hexdigest()[:16]
     packages = {package.__name__: package.__version__ for package in (mujoco, gymnasium, torch, np)}
     machine = f"{platform.machine()}, {os.cpu_count()} cores"
     return {
@@ -64,6 +77,7 @@ def versions():
         "machine": machine,
         "learner": code_version("envs", "models", "trpo"),
         "grounding": code_version("rgat", "train", "training/physics_grounding"),
+        **used,
     }
 
 
@@ -116,7 +130,7 @@ class Run:
             raise RunError(
                 f"cannot make the folder {folder}: {error.strerror}; choose another --out"
             ) from None
-        run.versions = versions()
+        run.versions = versions(settings)
         run.write_config(settings)
         return run
 
@@ -125,10 +139,10 @@ class Run:
         config = {"settings": settings, "versions": self.versions}
         write_whole(self.folder / "config.json", json.dumps(config, indent=1))
 
-    def require_this_version(self):
-        """Raises RunError if the run was begun with other code or packages: its
-        numbers would be of two kinds."""
-        for name, now in versions().items():
+    def require_this_version(self, settings=None):
+        """Raises RunError if the run of these settings (a dict) was begun with other code or
+        packages: its numbers would be of two kinds."""
+        for name, now in versions(settings).items():
             then = self.versions.get(name)
             if name not in ("machine", "python") and then != now:
                 raise RunError(
@@ -302,7 +316,7 @@ class Bar:
         at_steps = s.at_steps * s.algo.endswith("rgat")
         total = (
             s.pretrain_steps
-            + s.reference_steps * (s.algo != "real")
+            + s.reference_steps * (s.algo != "real" or bool(s.policy_from))
             + s.grounding_steps * (s.policy_steps + at_steps)
         )
         self.tqdm = tqdm(

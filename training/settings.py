@@ -2,14 +2,14 @@
 presets that fill them in, and the seeds."""
 
 import dataclasses
-import importlib.util
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from envs import ENV_IDS, TASKS, BatchEnv, model_path, parse_perturbation, perturb, task_of
+import envs
+from envs import BatchEnv, model_path, parse_perturbation, perturb, robot_of, task_of
 from rgat import AT_CONFIG, METHODS, GroundingSettings
 from training.run_folder import RunError
 from trpo import PRESETS, STABLE_BASELINES, TRPOConfig
@@ -107,7 +107,7 @@ class Settings:
     reference_steps: int = option(
         None,
         "steps on real, from scratch, of the policy that is the reference line (default: by task, "
-        "or --pretrain-steps if given)",
+        "or --pretrain-steps if given without --policy-from)",
     )
     grounding_steps: int = option(None, "rounds of Algorithm 1 (default: by task)")
     real_trajectories: int = option(
@@ -175,7 +175,7 @@ class Settings:
 
     @property
     def robot(self):
-        return self.env.split("-")[0]
+        return robot_of(self.env)
 
     def completed(self):
         """These settings with the preset's and the task's defaults filled in.
@@ -196,7 +196,7 @@ class Settings:
         }
         if self.real_data:
             defaults |= {"grounding_steps": 1, "reference_steps": 0}
-        elif self.pretrain_steps is not None:
+        elif self.pretrain_steps is not None and not self.policy_from:  # then they are the critic's
             defaults["reference_steps"] = self.pretrain_steps
         done = dataclasses.replace(
             self, **{k: v for k, v in defaults.items() if getattr(self, k) is None}
@@ -256,14 +256,8 @@ def load_task(path):
     its policy. Raises RunError, in one line, for a file that is none or a task that does not work.
     """
     path = Path(path)
-    name = path.stem
     try:
-        spec = importlib.util.spec_from_file_location(f"task_{name}", path)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        task = dataclasses.replace(module.TASK, xml=str((path.parent / module.TASK.xml).resolve()))
-        TASKS[name] = task
-        ENV_IDS.append(name) if name not in ENV_IDS else None
+        name, module = envs.load_task(path)
         PRESETS[name] = getattr(module, "LEARNER", TRPOConfig())
         DEFAULTS[name] = {"grounding_steps": 10, **LARGE, **getattr(module, "DEFAULTS", {})}
         env = BatchEnv(name, 2, nthread=1)
@@ -278,7 +272,7 @@ def load_task(path):
         raise RunError(f"--task {path}: observe() returns NaN or infinite values")
     if np.shape(reward) != (2,) or not np.isfinite(reward).all():
         raise RunError(f"--task {path}: reward() must return a finite number per robot, (N,)")
-    qpos, qvel = task.state(obs, env.model)
+    qpos, qvel = env.task.state(obs, env.model)
     if (qpos.shape, qvel.shape) != ((2, env.model.nq), (2, env.model.nv)):
         raise RunError(
             f"--task {path}: state() makes qpos {qpos.shape[1:]} and qvel {qvel.shape[1:]} of an "

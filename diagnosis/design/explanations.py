@@ -17,6 +17,7 @@ from diagnosis.recordings.layout import is_servo, joint_of
 from diagnosis.simulation.simulator import World
 
 STILL = 5.0  # noises: a joint that moved less never moved
+SLOPE = 0.03  # s over which a speed is taken: over single rows it would be the encoder's noise
 BEYOND = 0.25  # of the recorded range, by which a joint without limits may leave it
 SLACK = 0.02  # of a range, kept free at its ends
 DEFAULT_NOISE = 1e-3  # rad or m, where the report has none
@@ -120,12 +121,20 @@ def reached_by(recordings, model: mujoco.MjModel) -> dict:
         rates = []
         for r in recordings:
             known = np.isfinite(r.qpos[:, q])
-            rates.append(np.abs(np.diff(r.qpos[known, q]) / np.diff(r.time[known])))
+            rates.append(_speeds(r.time[known], r.qpos[known, q]))
         rates = np.concatenate(rates)
         if len(rates):
             speeds[joint] = float(np.quantile(rates, 0.995))
     period = float(np.median(np.concatenate([np.diff(r.time) for r in recordings])))
     return {"columns": columns, "speeds": speeds, "period": period, "start": start}
+
+
+def _speeds(time, position):
+    """Absolute speeds (rad/s or m/s) over SLOPE seconds from every row; none of fewer rows."""
+    if len(time) < 2:
+        return np.zeros(0)
+    rows = max(1, int(round(SLOPE / np.median(np.diff(time)))))
+    return np.abs((position[rows:] - position[:-rows]) / (time[rows:] - time[:-rows]))
 
 
 def limits_of(model: mujoco.MjModel, reached: dict, followed=()) -> Limits:
@@ -198,7 +207,8 @@ def _range(reached, column):
 def _explanations(world, summary):
     """(names, settings): all findings that can be simulated, then with one exchanged for each of
     its rivals."""
-    found = [(f, _setting(world, f)) for f in summary["findings"]]
+    written = [f for finding in summary["findings"] for f in _written(finding)]
+    found = [(f, _setting(world, f)) for f in written]
     base = {c: values for _, pair in found if pair for c, values in [pair]}
     names, settings = ["as diagnosed"], [base]
     for finding, pair in found:
@@ -208,6 +218,19 @@ def _explanations(world, summary):
                 settings.append({c: v for c, v in base.items() if c != pair[0]} | dict([other]))
                 names.append(f"{_words(rival)} instead of {_words(finding)}")
     return tuple(names), tuple(settings)
+
+
+def _written(finding):
+    """[finding] that the corrected model holds in the place of one: itself, or the nearest names of
+    a force without a name and without a curve. Such names have intervals; their rivals have none,
+    and can be exchanged only where there is one name."""
+    fitted = finding["effect"] != "unknown" or finding["parameters"]
+    if fitted or finding.get("written_as") not in ("mjcf", "python"):
+        return [finding]
+    names, rivals = [], []
+    for other in finding.get("also_possible") or []:
+        (names if all("low" in p for p in other["parameters"]) else rivals).append(other)
+    return [{**name, "also_possible": rivals if len(names) == 1 else []} for name in names]
 
 
 def _setting(world, finding):

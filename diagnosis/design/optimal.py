@@ -50,6 +50,11 @@ def design(left: Open, seconds: float = 10.0, seed: int = 0) -> Excitation:
         raise DesignError(
             "the model has no actuators; all that can be chosen is how it is released"
         )
+    if not any(left.settings) and not left.free:
+        raise DesignError(
+            "the report leaves nothing open that a recording could tell: no finding that can be "
+            "simulated, and no joint that never moved; diagnose recordings of other motion first"
+        )
     rng, limits = np.random.default_rng(seed), left.limits
     trial, time = Trial(left), np.arange(0.0, seconds, limits.period)
     span = limits.control_low, limits.control_high

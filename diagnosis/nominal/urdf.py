@@ -69,7 +69,8 @@ def _parsed(path):
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, UnicodeDecodeError, OSError) as error:
         raise UrdfError(f"{path}: the URDF is not XML ({error}); write it again") from None
-    if "{http://www.ros.org/wiki/xacro}" in text or re.search(r"<xacro:", text):
+    # by its elements: comments may speak of xacro, and its namespace has had several addresses
+    if any(re.match(r"\{[^}]*\bxacro\}", element.tag) for element in root.iter()):
         raise UrdfError(f"{path}: a xacro; expand it first (xacro {path} > robot.urdf)")
     return root
 

@@ -157,6 +157,12 @@ def _with_controls(path, sources, header, model, layout, foreign):
                 scale=target.scale * factor, offset=target.offset * factor
             )
         elif effort and not servo:
+            if joint in layout.gains or f"kp:{joint}" in sources:  # its control is a position then
+                raise RecordingError(
+                    f"{path}: with --kp or 'kp:{joint}' the control of {model.actuator(a).name!r} "
+                    f"is a target, and nothing in the file is one; add 'target:{joint}', or leave "
+                    f"the gains out: 'effort:{joint}' is a torque"
+                )
             factor = 1 / (gear * float(model.actuator_gainprm[a, 0]))
             sources[control] = effort._replace(
                 scale=effort.scale * factor, offset=effort.offset * factor

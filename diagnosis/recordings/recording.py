@@ -124,7 +124,7 @@ def accepted(recording, model):
             f"to "
             "follow it"
         )
-    return replace(made, start=recording.start)
+    return replace(made, start=recording.start, gains=recording.gains, notes=tuple(recording.notes))
 
 
 def _recording(path, name, columns, model, first_row):

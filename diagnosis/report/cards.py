@@ -24,6 +24,7 @@ WRITTEN = {
     "none": "has no plain MJCF form, so not in corrected.xml",
     "measurement": "a property of the measurement, so not in corrected.xml",
 }
+NOTHING = "nothing was fitted, so nothing is written"  # of a force without a name or a curve
 
 
 def cards(diagnosis: Diagnosis) -> list[dict]:
@@ -51,7 +52,10 @@ def cards(diagnosis: Diagnosis) -> list[dict]:
 def _facts(finding):
     """The evidence for a finding, in words."""
     facts = []
+    fitted = finding["effect"] != "unknown" or finding["parameters"] or finding.get("also_possible")
     for key, value in (finding.get("evidence") or {}).items():
+        if key in REMOVES and not fitted:
+            continue  # 0 %, for nothing was tried
         if isinstance(value, bool) or not isinstance(value, int | float):
             continue
         if not math.isfinite(value):
@@ -64,7 +68,7 @@ def _facts(finding):
             facts.append(f"{100 * value:.0f} % of the error there is left")
         else:
             facts.append(f"{key.replace('_', ' ')} {text.number(value)}")
-    return [*facts, WRITTEN[finding["written_as"]]]
+    return [*facts, WRITTEN[finding["written_as"]] if fitted else NOTHING]
 
 
 def _parameter(p):

@@ -111,7 +111,7 @@ def _mechanism(diagnosis):
     if moving := overlay.overlay(diagnosis):
         recording, start, seconds, motions = moving
         note = (
-            f"{recording} from {text.number(start)} s: from the recorded state, driven by the "
+            f"{recording} from {start:.2f} s: from the recorded state, driven by the "
             f"recorded control for {text.number(seconds, 2)} s. Of the held-out stretches, the one "
             "where the nominal model errs most."
         )
@@ -278,7 +278,8 @@ def reads_files(xml: str) -> bool:
 
 def _names(recordings, most=12):
     """The names of recordings in a line; of a held-out tail, from when on."""
-    begins = lambda r: f" from {text.number(r.time[r.start])} s on" if r.start else ""
+    # a fixed format, for the clock may count from 1970
+    begins = lambda r: f" from {r.time[r.start]:.2f} s on" if r.start else ""
     names = list(dict.fromkeys(r.name + begins(r) for r in recordings))
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

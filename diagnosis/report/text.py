@@ -314,12 +314,13 @@ def verdict_words(summary: dict) -> str:
         if ((summary.get("unexplained") or {}).get("fraction") or 0) > MUCH:
             return f"Something is missing, but {NO_EFFECT}"
         return f"Nothing is missing: {NO_EFFECT}"
-    count = len(summary["findings"])
-    return (
-        "One thing is wrong with the simulator."
-        if count == 1
-        else f"{count} things are wrong with the simulator."
-    )
+    sensors = sum(f.get("written_as") == "measurement" for f in summary["findings"])
+    simulator = len(summary["findings"]) - sensors
+    things = lambda count: "one thing is" if count == 1 else f"{count} things are"
+    if not simulator:
+        return f"The simulator shows no fault, but {things(sensors)} wrong with the sensors."
+    more = f", and {things(sensors)} wrong with the sensors" if sensors else ""
+    return sentence(f"{things(simulator)} wrong with the simulator{more}")
 
 
 def terminal(summary: dict, out: str, files: list[str]) -> str:

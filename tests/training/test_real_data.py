@@ -125,3 +125,15 @@ def test_recordings_of_another_robot_clock_or_place_are_refused_in_one_line(tmp_
     refused(tmp_path / "odd", "oracle", algo="oracle")
     with pytest.raises(RunError):
         RealData(tmp_path / "odd", BatchEnv(ENV, 1))
+
+
+def test_what_was_never_measured_is_named_before_anything_is_trained(tmp_path):
+    sim, header = BatchEnv(ENV, 1), names(BatchEnv(ENV, 1))
+    rows = record(tmp_path / "blind", "a.csv", velocities=False)
+    hinge = [[*row[:2], "", *row[3:]] for row in rows]
+    write(tmp_path / "blind" / "a.csv", header, hinge)
+    with pytest.raises(RunError, match="never measured: qpos:hinge;"):
+        RealData(tmp_path / "blind", sim)
+    record(tmp_path / "short", "a.csv", 5)
+    with pytest.raises(RunError, match="4 usable rows, and none to judge by"):
+        RealData(tmp_path / "short", sim)

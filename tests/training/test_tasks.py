@@ -6,6 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 
+import envs
+import rgat
 import train
 from envs import BatchEnv
 from training.run_folder import RunError
@@ -76,6 +78,32 @@ def test_a_robot_of_ones_own_is_grounded_and_resumed(tmp_path):
     rows = list(csv.DictReader((out / "progress.csv").open(newline="")))
     assert len(rows) == 3 and all(float(r["real_return_stochastic"]) < 0 for r in rows)
     assert int(rows[1]["real_transitions"]) == 2 * 60
+
+
+def test_a_run_of_a_file_with_a_hyphen_is_of_its_own_task_and_can_be_opened(tmp_path):
+    task = own(tmp_path).rename(tmp_path / "Hopper-arm.py")
+    assert Settings(task=str(task)).completed().pretrain_steps == 1234
+    assert BatchEnv("Hopper-arm", 1).model.nq == 2 and BatchEnv("Hopper-v4", 1).model.nq == 6
+    assert train.main(["--task", str(task), "--out", str(tmp_path / "run"), *TINY]) == 0
+    (tmp_path / "run" / "step_01.pt").rename(tmp_path / "run" / "step_100.pt")
+    for step in (10, 11):
+        (tmp_path / "run" / f"step_{step}.pt").write_text("not the last one")
+    envs.TASKS.pop("Hopper-arm")  # as in another process
+    envs.ENV_IDS.remove("Hopper-arm")
+    assert rgat.grounded_env(tmp_path / "run").reset(seed=0)[0].shape == (1, 4)
+    task.unlink()
+    with pytest.raises(envs.EnvError, match="Hopper-arm.py"):
+        rgat.grounded_env(tmp_path / "run")
+
+
+def test_a_run_does_not_go_on_with_another_task_or_model(tmp_path, capsys):
+    task, out = own(tmp_path), tmp_path / "run"
+    assert train.main(["--task", str(task), "--out", str(out), *TINY]) == 0
+    own(tmp_path, mjcf=MJCF.replace('size=".02"', 'size=".03"'))
+    assert train.main(["--resume", str(out), "--grounding-steps", "2"]) == 2
+    own(tmp_path, ARM.replace("- 1.0", "- 0.5"))
+    assert train.main(["--resume", str(out), "--grounding-steps", "2"]) == 2
+    assert capsys.readouterr().err.count("begun by another version (task") == 2
 
 
 DEFINE = "    def observe(self, qpos, qvel):\n        return {}\n\n    def reward"

@@ -18,8 +18,8 @@ class CsvFile:
     def read(self, path, name, data, model, layout: Layout) -> list[Raw]:
         """The one run of a file whose bytes are `data`. Raises RecordingError."""
         header, body, first_row = _parts(path, data)
-        _checked(path, header, model, layout)
-        columns = dict(zip(header, _table(path, body, header, first_row).T))
+        used = _checked(path, header, model, layout)
+        columns = dict(zip(header, _table(path, body, header, first_row, used).T))
         return [Raw(path, name, columns, {column: column for column in header}, first_row)]
 
 
@@ -65,8 +65,8 @@ def _parts(path, data):
     return header, body, above + 2
 
 
-def _table(path, body, header, first_row):
-    """(T, columns) of the text below the header."""
+def _table(path, body, header, first_row, used):
+    """(T, columns) of the text below the header; columns that are not of `used` may be NaN."""
     if not body.strip():
         raise RecordingError(f"{path}: a header and no rows; record again or leave it out")
     try:
@@ -80,12 +80,12 @@ def _table(path, body, header, first_row):
         ValueError,
         OverflowError,
     ):  # something is odd: read it slowly, to say where, or to accept empty cells
-        return _slow(path, body, header, first_row)
+        return _slow(path, body, header, first_row, used)
 
 
 def _checked(path, header, model, layout):
-    """The header, complete for the model. Raises RecordingError on unknown, repeated or missing
-    columns, before any row is read."""
+    """The columns that are read, complete for the model. Raises RecordingError on unknown, repeated
+    or missing ones, before any row is read."""
     known = Names(model)
     seen = []
     for position, name in enumerate(header, start=1):
@@ -97,8 +97,10 @@ def _checked(path, header, model, layout):
                 f"{path}: column {position} ({name!r}): stands twice in the header; remove one"
             )
         seen.append(ours or name)
-    layout.plan(path, header, {column: column for column in header}, model)
-    return header
+    plan = layout.plan(path, header, {column: column for column in header}, model)
+    if not layout.mapped:
+        return set(header)
+    return {source.column for source in plan.sources.values()}
 
 
 def _header_line(text):
@@ -113,9 +115,9 @@ def _header_line(text):
         above += 1
 
 
-def _slow(path, body, names, first_row):
-    """(T, columns) of a CSV body cell by cell: empty cells are NaN, anything else odd raises
-    RecordingError."""
+def _slow(path, body, names, first_row, used):
+    """(T, columns) of a CSV body cell by cell: empty cells are NaN, as are columns that are not of
+    `used`, which may hold words; anything else odd raises RecordingError."""
     rows = []
     lines = body.rstrip().split("\n")
     for row, line in enumerate(lines, start=first_row):
@@ -137,7 +139,10 @@ def _slow(path, body, names, first_row):
                 f"the "
                 f"row{why}"
             )
-        values = [float("nan") if cell == "" else _number(cell) for cell in cells]
+        values = [
+            _number(cell) if cell and name in used else float("nan")
+            for name, cell in zip(names, cells)
+        ]
         if None in values:
             k = values.index(None)
             raise RecordingError(

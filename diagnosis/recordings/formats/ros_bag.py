@@ -3,10 +3,10 @@ sensor_msgs/JointState.
 
 A joint's own columns are `<joint>.position`, `.velocity`, `.effort` and, from the topic of targets,
 `.target`; they become qpos, qvel, effort and target of that joint. Time is the messages' stamp, or
-when they were recorded where they carry none. In a column map, `[ros]` may name `topic` and
-`targets`, and `joints` (in the order of the targets, where these are a bare
-std_msgs/Float64MultiArray). Targets are JointState, Float64MultiArray or a trajectory controller's
-state (its reference).
+when they were recorded where they carry none; targets and states go by one clock. In a column map,
+`[ros]` may name `topic` and `targets`, and `joints` (in the order of the targets, where these are a
+bare std_msgs/Float64MultiArray). Targets are JointState, Float64MultiArray or a trajectory
+controller's state (its reference).
 """
 
 import os
@@ -48,15 +48,21 @@ class RosBag:
         if not states:
             raise RecordingError(f"{path}: the topic of joint states holds no messages")
         time, columns, notes = _states(path, states)
+        first = 0
         if targets:
-            columns |= _targets(path, targets, time, layout)
+            goals = _targets(path, targets, states, time, layout)
+            columns |= goals
+            first = _first(path, goals, model, layout)
+        if first:
+            notes += (f"rows before the first target are left out: {first}",)
+            time, columns = time[first:], {name: c[first:] for name, c in columns.items()}
         seconds = (time - time[0]) * 1e-9
         natural = {"time": "time"}
         for column in columns:
             joint, _, kind = column.rpartition(".")
             natural[f"{KINDS.get(kind, kind)}:{joint}"] = column
         name = os.path.basename(os.path.normpath(path))
-        return [Raw(path, name, {"time": seconds, **columns}, natural, 0, notes)]
+        return [Raw(path, name, {"time": seconds, **columns}, natural, first, notes)]
 
 
 def _bag(path):
@@ -112,9 +118,20 @@ def _messages(bag, connections):
 
 def _stamps(messages):
     """(T,) int64 ns: the messages' own stamps, or when they were recorded where any has none."""
+    if not _stamped(messages):
+        return _received(messages)
+    stamps = (m.header.stamp for _, m in messages)
+    return np.array([s.sec * 10**9 + s.nanosec for s in stamps], dtype=np.int64)
+
+
+def _stamped(messages):
+    """Whether all messages carry stamps of their own."""
     stamps = [m.header.stamp if hasattr(m, "header") else None for _, m in messages]
-    if all(s is not None and (s.sec or s.nanosec) for s in stamps):
-        return np.array([s.sec * 10**9 + s.nanosec for s in stamps], dtype=np.int64)
+    return all(s is not None and (s.sec or s.nanosec) for s in stamps)
+
+
+def _received(messages):
+    """(T,) int64 ns: when messages were recorded."""
     return np.array([time for time, _ in messages], dtype=np.int64)
 
 
@@ -157,16 +174,54 @@ def _held(values):
     return values[known[rows]]
 
 
-def _targets(path, messages, time, layout):
-    """{"<joint>.target": (T,)}: the last target told at or before each row. Raises RecordingError
-    on unknown messages."""
-    stamps, messages = _stamps(messages), [m for _, m in messages]
-    row = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, None)
-    told = [_told(path, m, layout) for m in messages]
-    joints = sorted({joint for one in told for joint in one})
-    return {
-        f"{j}.target": _held(np.array([one.get(j, np.nan) for one in told]))[row] for j in joints
-    }
+def _targets(path, messages, states, time, layout):
+    """{"<joint>.target": (T,)}: the last target told at or before each row, nan before the first.
+    time (T,) ns: of the rows that the messages `states` make. Raises RecordingError on unknown
+    messages, and where they and the states are not of the same time."""
+    stamps = _stamps(messages)
+    if not (_stamped(messages) and _stamped(states)):
+        # one clock for both: the bag's own, less how long after its stamp it noted the median state
+        late = np.sort(_received(states) - _stamps(states))
+        stamps = _received(messages) - late[len(late) // 2]
+    order = np.argsort(stamps, kind="stable")
+    stamps, told = stamps[order], [_told(path, messages[i][1], layout) for i in order]
+    if stamps[0] > time[-1] or stamps[-1] < time[0]:
+        _apart(path, stamps, time)
+    columns = {}
+    for joint in sorted({joint for one in told for joint in one}):
+        values = np.array([one.get(joint, np.nan) for one in told])
+        known = np.isfinite(values)
+        row = np.searchsorted(stamps[known], time, side="right")
+        columns[f"{joint}.target"] = np.concatenate([[np.nan], values[known]])[row]
+    return columns
+
+
+def _apart(path, stamps, time):
+    """Raises RecordingError: the targets' times and the states' do not overlap."""
+    targets, states = (f"{t[0] * 1e-9:.2f} to {t[-1] * 1e-9:.2f} s" for t in (stamps, time))
+    raise RecordingError(
+        f"{path}: targets are of {targets}, joint states of {states}: never at the same time; "
+        "stamp both by one clock, and record both together"
+    )
+
+
+def _first(path, told, model, layout):
+    """The first row in which every joint of the model that is told a target at all has one. Raises
+    RecordingError where one has none in any row."""
+    used = {source.column for source in layout.columns.values()}
+    for j in range(model.njnt):
+        name = model.joint(j).name
+        used.add(f"{layout.joints.get(name, name)}.target")
+    first = 0
+    for name in sorted(used & set(told)):
+        known = np.isfinite(told[name])
+        if not known.any():
+            raise RecordingError(
+                f"{path}: {name!r} is told after the last joint state, or never as a number; "
+                "record on while targets are told"
+            )
+        first = max(first, int(np.argmax(known)))
+    return first
 
 
 def _told(path, message, layout):

@@ -159,6 +159,45 @@ def test_limits():
     assert -0.2 < free.low[0] < -0.1 and 2.0 <= free.speed[0] < 3.0
 
 
+def test_a_speed_is_not_the_noise_of_an_encoder():
+    """A sine of known speed, read at 1 kHz in steps of 2 mrad: 2 rad/s between single rows."""
+    time = 1e-3 * np.arange(4000)
+    qpos = 2e-3 * np.round(0.1 * np.sin(2 * np.pi * 0.5 * time) / 2e-3)[:, None]
+    run = Recording("encoder", time, qpos, np.full(qpos.shape, np.nan), np.zeros(qpos.shape))
+    speed = reached_by([run], mujoco.MjModel.from_xml_string(MODEL))["speeds"]["pivot"]
+    true = 0.1 * 2 * np.pi * 0.5
+    assert true < speed < true + 2e-3 / 0.02
+
+
+def test_a_report_with_nothing_open_says_so(tmp_path, old):
+    folder = report(tmp_path / "report", old, [])
+    content = {"findings": [], "noise": {"qpos:pivot": NOISE}}
+    (tmp_path / "report" / "diagnosis.json").write_text(json.dumps(content))
+    with pytest.raises(DesignError, match="leaves nothing open that a recording could tell"):
+        design(Open.read(folder), seconds=1.0)
+
+
+def test_the_nearest_names_of_an_unknown_force_are_in_the_model(tmp_path, old):
+    """Those have intervals; a rival of the one name is an explanation beside it."""
+    folder = report(tmp_path / "report", old, [])
+    damping = finding("viscous_damping", "damping", 0.032)
+    damping["parameters"][0] |= {"low": 0.03, "high": None}
+    rival = finding("coulomb_friction", "frictionloss", 0.03)
+    unknown = {**finding("unknown", "", 0.0), "parameters": [], "written_as": "mjcf"}
+    unknown["also_possible"] = [damping, rival]
+    content = {"findings": [unknown], "noise": {"qpos:pivot": NOISE}}
+    (tmp_path / "report" / "diagnosis.json").write_text(json.dumps(content))
+    values = [
+        {c.effect.name: v for c, v in setting.items()} for setting in Open.read(folder).settings
+    ]
+    assert values == [{"viscous_damping": (0.032,)}, {"coulomb_friction": (0.03,)}]
+    unknown["also_possible"].append({**damping, "effect": "armature"})
+    unknown["also_possible"][-1]["parameters"] = [{**damping["parameters"][0], "name": "armature"}]
+    (tmp_path / "report" / "diagnosis.json").write_text(json.dumps(content))
+    [setting] = Open.read(folder).settings
+    assert {c.effect.name for c in setting} == {"viscous_damping", "armature"}
+
+
 def test_signals_stay_inside_and_begin_and_end_at_the_middle():
     rng, time = np.random.default_rng(0), DT * np.arange(500)
     low, high, middle = np.array([-1.0, 0.0]), np.array([2.0, 0.5]), np.array([0.0, 0.1])

@@ -77,6 +77,15 @@ def test_only_joints_that_are_said_to_be_driven_get_a_motor(tmp_path, kind):
     assert [model.actuator(a).name for a in range(model.nu)] == ["elbow"]
 
 
+@pytest.mark.parametrize("address", ["www.ros.org/wiki/xacro", "wiki.ros.org/xacro"])
+def test_a_xacro_is_told_by_its_elements(tmp_path, address):
+    """Not by a comment, as where the expanded file says what it was made of."""
+    assert load_world(urdf(tmp_path, more="<!-- from <xacro:arm/> -->")).model.njnt == 2
+    path = urdf(tmp_path, more=f'<x:arm xmlns:x="http://{address}"/>')
+    with pytest.raises(ModelError, match="a xacro; expand it first"):
+        load_world(path)
+
+
 def test_a_mesh_is_found_in_its_package(tmp_path):
     stl(tmp_path / "arm_description" / "meshes" / "upper.stl")
     (tmp_path / "arm_description" / "urdf").mkdir()

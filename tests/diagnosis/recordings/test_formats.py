@@ -92,10 +92,61 @@ def test_targets_of_a_bag_act_from_when_they_were_told(tmp_path, servos, good):
     bag = write_bag(tmp_path / "bag", {"/joint_states": states(good), "/goal": told})
     (tmp_path / "map.toml").write_text('[ros]\ntargets = "/goal"\n')
     (got,) = load(bag, servos, load_layout(str(tmp_path / "map.toml")))
-    rows = np.clip(
-        (np.arange(len(good)) - 1) // 5 * 5, 0, None
-    )  # 4 ms late: it holds from the row after
+    # 4 ms late: it holds from the row after, and in the first row nothing is told yet
+    rows = np.arange(len(good) - 1) // 5 * 5
     np.testing.assert_allclose(got.ctrl, good[rows, 5:7])
+    np.testing.assert_allclose(got.qpos, good[1:, 1:3])
+    np.testing.assert_allclose(got.time, good[1:, 0] - good[1, 0], atol=1e-9)
+    assert got.notes == ("rows before the first target are left out: 1",)
+
+
+def goal_map(folder):
+    """The layout of targets on /goal, the elbow's first where messages name no joints."""
+    path = folder / "map.toml"
+    path.write_text('[ros]\ntargets = "/goal"\njoints = ["elbow", "shoulder"]\n')
+    return load_layout(str(path))
+
+
+def test_targets_without_stamps_go_by_the_clock_of_states_that_have_some(tmp_path, servos, good):
+    """States are stamped by another clock and received 5 ms late; targets, sorted or not, 4 ms
+    after a row's: they hold from the next row on."""
+    told = [(int(row[0] * 1e9) + 9_000_000, list(row[[6, 5]])) for row in good]
+    bag = write_bag(tmp_path / "bag", {"/joint_states": states(good), "/goal": told[::-1]})
+    (got,) = load(bag, servos, goal_map(tmp_path))
+    np.testing.assert_allclose(got.ctrl, good[:-1, 5:7])
+    np.testing.assert_allclose(got.qpos, good[1:, 1:3])
+
+
+def test_stamped_targets_out_of_order(tmp_path, servos, good):
+    """The order of recording is the reverse of that of the stamps, which counts."""
+    told = [
+        (10**9 - k, joint_state(10**18 + int(round(row[0] * 1e9)), JOINTS, row[5:7], [], []))
+        for k, row in enumerate(good)
+    ]
+    bag = write_bag(tmp_path / "bag", {"/joint_states": states(good), "/goal": told})
+    (got,) = load(bag, servos, goal_map(tmp_path))
+    np.testing.assert_allclose(got.ctrl, good[:, 5:7])
+
+
+def test_targets_of_another_time_are_refused(tmp_path, servos, good):
+    told = [(int(row[0] * 1e9), joint_state(10**9, JOINTS, row[5:7], [], [])) for row in good]
+    bag = write_bag(tmp_path / "bag", {"/joint_states": states(good), "/goal": told})
+    with pytest.raises(RecordingError, match="targets are of 1.00 .*never at the same time"):
+        load(bag, servos, goal_map(tmp_path))
+
+
+def test_a_bag_begins_where_every_joint_has_been_told_a_target(tmp_path, servos, good):
+    """The elbow is told from row 30 on; a gripper, which the model lacks, later still."""
+    told = []
+    for k, row in enumerate(good[10:], start=10):
+        names = JOINTS[: 1 + (k >= 30)] + ["gripper"] * (k >= 60)
+        stamp = 10**18 + int(round(row[0] * 1e9))
+        told.append((k, joint_state(stamp, names, [*row[5:7], 0.0][: len(names)], [], [])))
+    bag = write_bag(tmp_path / "bag", {"/joint_states": states(good), "/goal": told})
+    (got,) = load(bag, servos, goal_map(tmp_path))
+    np.testing.assert_allclose(got.qpos, good[30:, 1:3])
+    np.testing.assert_allclose(got.ctrl, good[30:, 5:7])
+    assert got.notes == ("rows before the first target are left out: 30",)
 
 
 def test_targets_without_names_take_their_order_from_the_map(tmp_path, servos, good):
@@ -246,6 +297,35 @@ def test_targets_for_motors_need_gains(tmp_path, model, good):
         load(path, model)
     (got,) = load(path, model, Layout(gains=frozenset(JOINTS)))
     np.testing.assert_allclose(got.ctrl, good[:, 1:3] + 0.1)
+
+
+def test_an_effort_is_no_target(tmp_path, model, good):
+    """With gains a motor's control is a position: a torque must not stand in for it."""
+    names = ["time", *(f"{kind}:{j}" for kind in ("qpos", "qvel", "effort") for j in JOINTS)]
+    (tmp_path / "run.csv").write_bytes(text(good[:, :7], names))
+    (got,) = load(tmp_path / "run.csv", model)
+    np.testing.assert_allclose(got.ctrl, good[:, 5:7])
+    with pytest.raises(RecordingError, match="is a target, and nothing in the file is one"):
+        load(tmp_path / "run.csv", model, Layout(gains=frozenset(JOINTS)))
+    gains = np.full((len(good), 2), 20.0)
+    names += [f"kp:{j}" for j in JOINTS]
+    (tmp_path / "kp.csv").write_bytes(text(np.column_stack([good[:, :7], gains]), names))
+    with pytest.raises(RecordingError, match="is a target, and nothing in the file is one"):
+        load(tmp_path / "kp.csv", model)
+
+
+def test_words_in_columns_that_nobody_names(tmp_path, model, good):
+    """A column map passes over them; in a column that is read they are an error still."""
+    names = ["time", *(f"{kind}:{j}" for kind in ("qpos", "qvel", "effort") for j in JOINTS)]
+    head, *rows = text(good[:, :7], names).decode().splitlines()
+    lines = [f"mode,{head}", *(f"swing {k},{row}" for k, row in enumerate(rows))]
+    (tmp_path / "run.csv").write_text("\n".join(lines))
+    (tmp_path / "map.toml").write_text('[columns]\n"qpos:elbow" = "qpos:elbow"\n')
+    (got,) = load(tmp_path / "run.csv", model, load_layout(str(tmp_path / "map.toml")))
+    np.testing.assert_allclose(got.ctrl, good[:, 5:7])
+    (tmp_path / "map.toml").write_text('[columns]\n"qpos:elbow" = "mode"\n')
+    with pytest.raises(RecordingError, match="row 2, column 'mode': 'swing 0' is not a number"):
+        load(tmp_path / "run.csv", model, load_layout(str(tmp_path / "map.toml")))
 
 
 def test_the_error_names_the_extra(tmp_path, model, good, monkeypatch):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from diagnosis.recordings.columns import columns_of
 from diagnosis.recordings.plausibility import check
-from diagnosis.recordings.recording import Recording, RecordingError, load
+from diagnosis.recordings.recording import Recording, RecordingError, accepted, load
 
 REAL = str(Path(__file__).resolve().parents[4] / "shared" / "recordings")
 FREE = """
@@ -177,6 +177,12 @@ def test_minari_episodes(model, monkeypatch):
     dataset.episodes.clear()
     with pytest.raises(RecordingError, match="arm/random-v0: the dataset holds no episodes"):
         load("arm/random-v0", model)
+
+
+def test_a_recording_made_in_python_keeps_gains_and_notes(model, good):
+    more = {"gains": {"elbow": {"kp": 20.0, "kd": 0.5}}, "notes": ("in degrees, perhaps",)}
+    got = accepted(replace(recording(good), **more), model)
+    assert (got.gains, got.notes) == (more["gains"], more["notes"])
 
 
 def test_files_of_one_name_are_told_apart(tmp_path, model, good):

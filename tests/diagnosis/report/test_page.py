@@ -4,9 +4,11 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
+from report_example import finding
 
 from diagnosis.report import sections
 
@@ -50,6 +52,23 @@ def test_page_is_well_formed_and_self_contained(kind, request):
     assert not re.search(r"https?://|url\(|@import", page)
     assert len(page) < 2_000_000 and "nan" not in re.findall(r'd="([^"]*)"', page)
     assert "<stays>" not in page
+
+
+def test_a_force_to_which_nothing_was_fitted(diagnosis):
+    bare = finding("unknown", "joint", "elbow", 0, 0, 1, "", parameters=[], written_as="none")
+    bare |= {"evidence": {"held_out_error_removed": 0.0, "p_value": None}, "adequate": False}
+    diagnosis.summary["findings"], diagnosis.settings = [bare], {}
+    page = sections.html_page(diagnosis)
+    assert '<p class="facts">nothing was fitted, so nothing is written</p>' in page
+
+
+def test_a_clock_that_counts_from_1970(diagnosis):
+    [held] = diagnosis.held_out
+    diagnosis.held_out = [replace(held, time=held.time - held.time[0] + 1.7e9, start=100)]
+    page, begin = sections.html_page(diagnosis), diagnosis.held_out[0].time[100]
+    assert f"{held.name} from {begin:.2f} s on" in page
+    told = re.search(rf"{re.escape(held.name)} from (\S+) s: from the recorded state", page)
+    assert 1.7e9 < float(told[1]) < 1.7e9 + 3
 
 
 def test_page_says_it_all(diagnosis):

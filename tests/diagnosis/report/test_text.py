@@ -79,6 +79,18 @@ def test_a_stop_on_one_side_and_a_model_that_blows_up(diagnosis, tmp_path):
     assert "the nominal model blows up" in wording.terminal(written, "out", ["report.html"])
 
 
+def test_the_verdict_counts_the_simulators_faults_apart_from_the_sensors():
+    one, sensor = {"effect": "mass", "written_as": "mjcf"}, {"effect": "sensor_bias"}
+    sensor["written_as"] = "measurement"
+    said = lambda *findings: wording.verdict_words({"verdict": "mismatch", "findings": findings})
+    assert said(one) == "One thing is wrong with the simulator."
+    assert said(one, one) == "2 things are wrong with the simulator."
+    words = "The simulator shows no fault, but one thing is wrong with the sensors."
+    assert said(sensor) == words
+    words = "2 things are wrong with the simulator, and one thing is wrong with the sensors."
+    assert said(one, sensor, one) == words
+
+
 def test_the_experiment_for_two_rivals():
     rival = {"effect": "lag", "place": {"kind": "actuator", "name": "drive"}}
     (line,) = experiments.advice(
