@@ -48,14 +48,16 @@ def lost(models, a, change):
     """
     model, force = models[0], actuator_force(models, a)
     j, gear = model.actuator_trnid[a, 0], model.actuator_gear[a, 0]
-    d, within = model.jnt_dofadr[j], joint_limit(models, j)
-    others = [(model.actuator_gear[b, 0], actuator_force(models, b)) for b in drives_of(model, j)]
+    d, within, asked = model.jnt_dofadr[j], joint_limit(models, j), asked_torque(models, j)
+    limited = any(
+        m.jnt_actfrclimited[j] for m in models
+    )  # else what all drives ask for is no matter
 
     def function(qpos, qvel, ctrl, time):
         out, state = np.zeros_like(qvel), (qpos, qvel, ctrl)
-        lost = gear * change(force(*state), gear * qvel[:, d], time)
-        whole = sum(g * other(*state) for g, other in others)
-        out[:, d] = within(whole + lost) - within(whole)
+        less = gear * change(force(*state), gear * qvel[:, d], time)
+        whole = asked(*state) if limited else 0.0
+        out[:, d] = within(whole + less) - within(whole)
         return out
 
     return function
@@ -85,12 +87,18 @@ def drives_of(model, j):
     ]
 
 
-def drive_torque(models, j):
-    """Function (qpos, qvel, ctrl) -> (S,) force of all the drives of joint j, in its coordinate."""
+def asked_torque(models, j):
+    """Function (qpos, qvel, ctrl) -> (S,) force of all the drives of joint j, in its coordinate, as
+    if that had no actuatorfrcrange."""
     model = models[0]
     forces = [(model.actuator_gear[a, 0], actuator_force(models, a)) for a in drives_of(model, j)]
-    within = joint_limit(models, j)
-    return lambda qpos, qvel, ctrl: within(sum(g * force(qpos, qvel, ctrl) for g, force in forces))
+    return lambda qpos, qvel, ctrl: sum(g * force(qpos, qvel, ctrl) for g, force in forces)
+
+
+def drive_torque(models, j):
+    """As asked_torque(), within the joint's actuatorfrcrange."""
+    within, asked = joint_limit(models, j), asked_torque(models, j)
+    return lambda qpos, qvel, ctrl: within(asked(qpos, qvel, ctrl))
 
 
 @catalogue

@@ -53,15 +53,15 @@ class StribeckFriction(JointEffect):
         M, force = self.scale(model, i), self.unit(model, i, "N·m", "N")
         held = float(model.dof_frictionloss[model.jnt_dofadr[i]])
         return (
-            Parameter("coulomb", force, held, 0.0, HUGE * M + held, 0.05 * M),
-            Parameter("static", force, held, 0.0, HUGE * M + held, 0.05 * M),
+            Parameter("coulomb", force, held, 0.0, HUGE * M, 0.05 * M),
+            Parameter("static", force, held, 0.0, HUGE * M, 0.05 * M),
             Parameter("velocity", self.unit(model, i, "rad/s", "m/s"), 0.1, 1e-4, 100.0, 0.01),
         )
 
     def probes(self, model, i, recordings):
         step, (_, speed) = 0.05 * self.scale(model, i), self.travel(model, i, recordings)
         slow = np.quantile(speed, [0.2, 0.5]) + 1e-4
-        held = float(model.dof_frictionloss[model.jnt_dofadr[i]])
+        held = self.parameters(model, i)[0].nominal
         return np.array([(held + step, held + r * step, v) for v in slow for r in (1.5, 3.0)])
 
     def possible(self, values, nominal):

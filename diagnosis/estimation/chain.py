@@ -19,7 +19,9 @@ from diagnosis.simulation.rows import RowMap, coarse
 GROUPED = 19  # rows in each group, in which forces are compared
 OUTSIDE = 0.1  # share of a located force that may hang by rows outside of the windows
 # fields of a model that its inertia hangs by
-INERTIAL = "body_mass body_inertia body_ipos body_iquat body_pos dof_armature tendon_armature"
+INERTIAL = (
+    "body_mass body_inertia body_ipos body_iquat body_pos dof_armature tendon_armature".split()
+)
 ASTRAY = 1e3  # times its travel, to where a chain of transitions at stiff stops may run away
 
 
@@ -234,9 +236,7 @@ class Chain(Ahead):
 
 def _as_heavy(model, other):
     """Whether two models' inertia is the same in every position."""
-    return all(
-        np.array_equal(getattr(model, name), getattr(other, name)) for name in INERTIAL.split()
-    )
+    return all(np.array_equal(getattr(model, name), getattr(other, name)) for name in INERTIAL)
 
 
 def _times_mass(model, qpos, qvel):

@@ -68,11 +68,15 @@ def dependences(world, trajectory, recordings, most=4, rows=True):
             continue
         name, d = windowing.joint_name(model, j), model.jnt_dofadr[j]
         force = trajectory.force[keep, d]
+        usual, force = (
+            _clipped(force, size) for size in (1.4826 * np.median(abs(force)), rms(force))
+        )
         for variable, x in axes.items():
             for factor, times in _factors(model, trajectory, ctrl, j, variable).items():
                 returns = variable in (f"position:{name}", "time")
                 for wave in (False, True) if returns else (False,):
-                    curve = _explained(force, x[keep], times[keep], block, variable, wave)
+                    some = x[keep], times[keep], block, variable, wave
+                    curve = _explained(usual, force, *some)
                     if curve.share > LEAST:
                         candidate = world.curve(name, variable, curve.knots, factor, wave)
                         told = candidate.effect.depends_on
@@ -134,13 +138,12 @@ def places_of(x, variable):
     return low + (high - low) * (even + 1) / 2
 
 
-def _explained(force, x, times, block, variable, wave=False):
+def _explained(usual, force, x, times, block, variable, wave=False):
     """The Curve of a force over x, times a factor: linear between knots, or a wave.
 
-    Where it bends, and whether, is told by the force within what is usual; how large it is, by what
-    is not there most of the time as well.
+    Where it bends, and whether, is told by the usual force (n,); how large it is, by force (n,),
+    which holds what is not there most of the time as well.
     """
-    usual, force = _clipped(force, 1.4826 * np.median(abs(force))), _clipped(force, rms(force))
     if wave:
         knots = _quarter(usual, x, times)
         turn = np.pi / 2 * (x - knots[0]) / (knots[1] - knots[0])

@@ -166,12 +166,10 @@ def names(finding, item):
 
 def _says(told, variable):
     """Whether variables told hold one: what a drive gives is its control's or its joint's load."""
-    kind, _, place = variable.partition(":")
-    loads = {t for t in told if t.startswith("load:")}
-    same = {
-        t for t in loads if kind == "control" and beside({"name": t}, {"place": {"name": place}})
-    }
-    return variable in told or bool(same)
+    kind, _, name = variable.partition(":")
+    drive = {"place": {"name": name}}
+    loads = [{"name": t} for t in told if t.startswith("load:")] if kind == "control" else []
+    return variable in told or any(beside(load, drive) for load in loads)
 
 
 def listed(finding, item):

@@ -160,7 +160,7 @@ def test_chosen_knots_predict_no_force_that_wanders_by_itself():
     block = np.arange(2000) * 16 // 2000
     for _ in range(30):
         x, force = (np.convolve(rng.normal(size=2024), smooth, "valid") for _ in range(2))
-        seen.append(_explained(force, x, np.ones(2000), block, "position:j").share > LEAST)
+        seen.append(_explained(force, force, x, np.ones(2000), block, "position:j").share > LEAST)
     assert np.mean(seen) < 0.15
 
 
