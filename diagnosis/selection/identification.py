@@ -5,7 +5,7 @@ found.fitted.setting; found.trajectory
 """
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
@@ -23,12 +23,10 @@ from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.rivals import TIED, as_good, carried
 from diagnosis.selection.starts import Starts
-from diagnosis.selection.unmodelled_force import ABOVE, dependences
+from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
-ELSEWHERE = 1  # sets at most from which the search is begun again
-ALIKE = 0.8  # cosine of what two sets leave, from which they leave the same
 CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
 ALONE = 4  # single effects that it judges beside them
@@ -60,28 +58,15 @@ class Identification:
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
         self.seen, self.missing, self.sets = {}, None, []
-        self.judged, self.ranking = None, []  # of the first round: sets that are earned; see Found
+        self.ranking = []
         self.looked = 1.0  # how many different columns a round looks at
-        self.candidates = [
-            c for c in world.candidates if c.place.kind != "sensor" and not c.effect.timed
-        ]
+        apart = lambda c: c.place.kind == "sensor" or c.effect.timed or c.effect.numerical
+        self.candidates = [c for c in world.candidates if not apart(c)]
 
     def run(self, setting=None):
         """The Found of all rounds, begun with the nominal model, or with a setting."""
         setting = setting or {}
-        trajectory, first = self.locate(setting)
-        found = self._rounds(setting, trajectory, first)
-        for other in self._elsewhere(found):
-            self.log(f" begun elsewhere: {said(other.setting)}")
-            search = copy(self)  # what it finds out is kept where it ends better
-            search.smoother, search.missing, search.sets = copy(self.smoother), None, []
-            start = search.smoother.locate(other.setting, first, passes=1)
-            again = search._rounds(other.setting, start, first, rival=found.fitted.setting)
-            again = search._better_end(again, found)
-            if again:
-                found = again
-                vars(self).update(vars(search))
-        return replace(found, ranking=self.ranking)
+        return self._rounds(setting, *self.locate(setting))
 
     def locate(self, setting):
         """(trajectory under a setting, trajectory under the nominal model), by which the windows
@@ -104,16 +89,14 @@ class Identification:
         self.screen.start(trajectory, setting)
         self.trajectory = trajectory
 
-    def _rounds(self, setting, trajectory, first, rival=None):
-        """The Found of rounds begun with a setting, and the trajectory located under it; rival: a
-        setting than which each round has to end better, for another."""
+    def _rounds(self, setting, trajectory, first):
+        """The Found of rounds begun with a setting, and the trajectory located under it."""
         for i in range(ROUNDS):
             self.begin(setting, trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
             judge = self.judge()
-            most = judge.fit(rival).loss if rival else np.inf
-            fitted, better = self._round(setting, judge, most)
-            if not better or fitted.loss >= most:
+            fitted, better = self._round(setting, judge)
+            if not better:
                 break
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory, passes=1)
@@ -124,38 +107,7 @@ class Identification:
             fitted = judge.fit(setting)
             self.sets = carried(judge, self.sets, fitted, fitted)
         known = trajectory, first, self.smoother, self.usual, judge
-        return Found(fitted, *known, self.missing, [], self.sets)
-
-    def _elsewhere(self, found):
-        """Fitted sets of the first round that leave something else than the best one did, best
-        first, where the force that the search left follows anything by more than it scatters: what
-        is taken first may hide what needs another beside it. Neither a curve without a name is a
-        place to begin, nor are names that predict worse than one."""
-        left = dependences(self.world, found.trajectory, self.train, most=1)
-        if not left or left[0].above < ABOVE:
-            return []
-        apart = []
-        for f in sorted(self.judged, key=lambda f: f.loss):
-            if any(isinstance(c.effect, Unknown) for c in f.setting):
-                break
-            if all(abs(f.left @ other.left) < ALIKE for other in apart):
-                apart.append(f)
-        return [f for f in apart[1:] if physics(f.setting) - set(found.fitted.setting)][:ELSEWHERE]
-
-    def _better_end(self, again, found):
-        """A Found without what it does not need, if that is better than another one by its own
-        judge, and earned over the nominal model in finer steps; or None."""
-        judge, before = again.judge, again.judge.fit(found.fitted.setting)
-        if again.fitted.score.loss >= before.loss:  # whatever of it is not needed
-            return None
-        nothing = self.finer(judge, judge.fit({}))
-        fitted = self.pruned(judge, again.fitted, nothing)
-        self.log(f" ends {fitted.loss:.3f}, before {before.loss:.3f}")
-        better = fitted.settled and fitted.loss < before.loss - TIED
-        if not better or not self.earned(nothing, fitted):
-            return None
-        here = again.smoother.locate(fitted.setting, again.trajectory, passes=1)
-        return replace(again, fitted=fitted, trajectory=here)
+        return Found(fitted, *known, self.missing, self.ranking, self.sets)
 
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
@@ -168,9 +120,8 @@ class Identification:
         ahead.start(copy(self.smoother).locate(setting, self.trajectory, passes=2), setting)
         return Judge(ahead, self.usual, judge.reference, self.seen)
 
-    def _round(self, setting, judge, most):
-        """(Fitted, whether it holds other effects than there were); most: a loss from which on it
-        is of no use, whatever of it is not needed."""
+    def _round(self, setting, judge):
+        """(Fitted, whether it holds other effects than there were)."""
         others = [c for c in self.candidates if c not in setting]
         every, curves = [*setting, *others], self._curves(setting)
         known = self.usual, self.seen, self.trajectory, self.screen.touches
@@ -185,17 +136,9 @@ class Identification:
         self.looked = max(evidence.different(), 1.0)
         beam, now = Beam(columns, evidence, missing), judge.fit(setting)
         self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; {now.loss:.3f}")
-        if self.judged is None:  # the first look of all
-            self.ranking = beam.ranking()
+        self.ranking = self.ranking or beam.ranking()  # of the first look of all
         judged = self._judged(judge, beam, now)
-        if self.judged is None:
-            bare = [f for f in judged if f.settled and not physics(f.setting) - set(setting)]
-            least = min([now, *bare], key=lambda f: f.loss)
-            self.judged = [f for f in judged if f.settled and self.earned(least, f)]
-        best = self._choose(judged, now)
-        if best.score.loss >= most:
-            return best, False
-        best = self._ended(judge, best, now)
+        best = self._ended(judge, self._choose(judged, now), now)
         best = self._beside(judge, judged, now, best)
         return best, best.setting.keys() != setting.keys()
 
@@ -254,8 +197,6 @@ class Identification:
                 break
             options = beam.columns.options
             added = [options[k].candidate for k in node.options[len(start.options) :]]
-            # a finer step is no other explanation
-            added = physics(added) or added
             chance = not self.no_chance(paired(start.score, node.score), len(added))
             if node.loss >= start.loss and chance:
                 continue
@@ -298,13 +239,15 @@ class Identification:
         return more if more.loss < fitted.loss else fitted
 
     def _ended(self, judge, best, now):
-        """What a round ends with: the best set without what it does not need, or what there was."""
+        """What a round ends with: the best set without what it does not need, or what there was, or
+        that in finer steps: what these alone explain as well is no physics."""
+        fine = self.finer(judge, now)
+        fine = fine if self.earned(now, fine) else now
         if best is not now:
             best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
-            # what finer steps alone explain as well is no physics
-            if physics(best.setting) - set(now.setting):
-                best = best if self.earned(self.finer(judge, now), best) else now
-            self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
+        if best is now or not self.earned(fine, best):
+            best = fine
+        self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
         return best
 
     def earned(self, before, after):

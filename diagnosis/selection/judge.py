@@ -37,14 +37,6 @@ class Fitted:
         return self.score.loss + PRICE * complexity(self.setting)
 
     @property
-    def left(self):
-        """What it leaves of the measured motion, in its noise, a vector of length one."""
-        ahead = self.columns.ahead
-        left = np.where(ahead.known, self.columns.residual / ahead.noise, 0.0).ravel()
-        left = left[np.isfinite(left)]
-        return left / (np.linalg.norm(left) + 1e-300)
-
-    @property
     def settled(self):
         """Whether no value lies at a bound of what is plausible."""
         return len(self.inside) == len(self.setting)

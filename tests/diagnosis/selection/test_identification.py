@@ -189,17 +189,6 @@ def test_single_curves_of_a_joint_take_one_place_among_those_that_are_judged(sea
     assert search._finalists(beam, node(noise, 0.0), nodes) == ([], [nodes[0], nodes[5]])
 
 
-def test_a_finer_step_makes_no_other_explanation_of_a_set(search):
-    noise, step = 1e-3 * np.arange(16), search.world.candidate("time_step", "world")
-    named = [*search.world.candidates[:4], step]
-    effects = [SimpleNamespace(candidate=candidate) for candidate in named]
-    beam = SimpleNamespace(columns=SimpleNamespace(options=effects))
-    finer, plain = node(noise - 0.6, 0.2, 0, 1, 4), node(noise - 0.5, 0.2, 0, 1)
-    other, alone = node(noise - 0.4, 0.2, 2, 3), node(noise - 0.3, 0.1, 4)
-    finalists = search._finalists(beam, node(noise, 0.0), [finer, plain, other, alone])
-    assert finalists == ([finer, other, alone], [])
-
-
 def limited(search, beyond, kept=()):
     """What is judged, [names], where values of the effects `beyond` end at a bound: of a beam that
     finds two sets of the first four effects, and further ones when it leaves some out."""
@@ -280,149 +269,39 @@ def test_a_stop_on_a_side_where_none_is_met_is_no_finding(search, shown, left):
     assert changing(judge, stopped).setting == ({stop: left} if left else {})
 
 
-def leaves(search, names, loss, angle):
-    """A Fitted that leaves a direction at an angle, in degrees, from that of others."""
-    told = fitted(search, names, loss)
-    told.left = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
-    return told
-
-
-def begun_elsewhere(search, monkeypatch, above, ended=("viscous_damping",), curve=1.0):
-    """First effects of the sets from which a search begins again that ended with some; curve: loss
-    of a set without a name."""
-    left = [Dependence("elbow", ("time",), 0.9, None, (), above)] if above else []
-    monkeypatch.setattr(identification, "dependences", lambda *args, most: left)
-    search.judged = [
-        leaves(search, ["coulomb_friction"], -1.0, 60),
-        leaves(search, ["viscous_damping", "stiffness"], -2.0, 0),
-        leaves(search, ["stribeck_friction"], -1.8, 20),  # leaves the same
-        leaves(search, ["armature"], -1.5, -60),
-        leaves(search, [], curve, 120),
-    ]
-    search.judged[-1].setting = {search.world.curve("elbow", "time", (0.0, 1.0)): ()}
-    found = SimpleNamespace(fitted=fitted(search, ended, -2.0), trajectory=None)
-    return [next(iter(f.setting)).effect.name for f in search._elsewhere(found)]
-
-
-def test_a_search_that_leaves_something_begins_again_where_something_else_was_left(
-    search, monkeypatch
-):
-    again = begun_elsewhere(search, monkeypatch, 1.5)
-    assert again == ["armature"]  # the best one
-    assert begun_elsewhere(search, monkeypatch, 0.9) == []  # what is left is within its scatter
-    assert begun_elsewhere(search, monkeypatch, None) == []
-    ended = begun_elsewhere(search, monkeypatch, 1.5, ("armature", "viscous_damping"))
-    assert ended == ["coulomb_friction"]  # not what it ended with
-    for loss, there in ((-1.7, []), (0.0, ["armature"])):  # of a curve without a name
-        assert begun_elsewhere(search, monkeypatch, 1.5, curve=loss) == there
-
-
-@pytest.mark.parametrize(
-    "loss, settled, better",
-    [
-        (-1.2, True, True),
-        (-1.05, True, False),
-        (-0.9, True, False),
-        (-1.2, False, False),
-        (-1.2, None, False),
-    ],
-)
-def test_another_end_is_taken_where_it_is_better_and_earned(
-    search, monkeypatch, loss, settled, better
-):
-    nothing = fitted(search, [], 0.0 if settled is not None else -2.0)
-    before = SimpleNamespace(fitted=fitted(search, ["coulomb_friction"], 9.0))
-    same = fitted(search, ["coulomb_friction"], 0.0)  # by the judge of the other search
-    same.loss = -1.0
-    judge = SimpleNamespace(fit=lambda setting: same if setting else nothing)
-    locate = lambda setting, trajectory, passes: (tuple(setting), trajectory)
-    again = SimpleNamespace(fitted=fitted(search, ["armature"], 0.0, bool(settled)), judge=judge)
-    again.smoother, again.trajectory = SimpleNamespace(locate=locate), "of its last round"
-    again.fitted.loss = loss
-    again.fitted.score = Score(loss, loss + 1e-3 * np.arange(16), 3 * loss * np.ones(16), ())
-    monkeypatch.setattr(search, "finer", lambda judge, fitted: fitted)
-    monkeypatch.setattr(search, "pruned", lambda judge, fitted, now: fitted)
-    replace = lambda found, **new: SimpleNamespace(**vars(found) | new)
-    monkeypatch.setattr(identification, "replace", replace)
-    ended = search._better_end(again, before)
-    assert (ended and ended.fitted) is (again.fitted if better else None)
-    if better:  # the motion is that under what it ends with
-        assert ended.trajectory == (tuple(again.fitted.setting), "of its last round")
-
-
-def test_rounds_begun_elsewhere_go_on_only_where_they_are_better(search, monkeypatch):
+def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
     best, asked = fitted(search, ["armature"], -1.0), []
     monkeypatch.setattr(search, "begin", lambda *given: None)
+    monkeypatch.setattr(search, "judge", lambda: None)
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
 
-    def round_of(setting, judge, most):
-        asked.append((setting, most))
+    def round_of(setting, judge):
+        asked.append(setting)
         return best, len(asked) < 2
 
     monkeypatch.setattr(search, "_round", round_of)
-    rival = fitted(search, ["coulomb_friction"], 0.0)
-    judge = SimpleNamespace(fit=lambda setting: rival)
-    monkeypatch.setattr(search, "judge", lambda: judge)
-    for loss, given, rounds in (
-        (best.loss, rival.setting, 1),
-        (best.loss + 0.1, rival.setting, 2),
-        (best.loss, None, 2),
-    ):
-        rival.loss = loss
-        asked.clear()
-        found = search._rounds({}, "located", "first", rival=given)
-        most = loss if given else np.inf
-        assert asked == [({}, most), (best.setting, most)][:rounds] and found.fitted is best
-        assert found.trajectory == ["located", "moved"][rounds - 1]
-
-
-@pytest.mark.parametrize("better", [True, False])
-def test_what_a_search_begun_elsewhere_finds_out_is_kept_where_it_ends_better(
-    search, monkeypatch, better
-):
-    ends = iter(["first search", "second search"])
-    monkeypatch.setattr(identification, "Smoother", lambda *given: Located())
-    monkeypatch.setattr(identification, "Usual", lambda *given: None)
-    monkeypatch.setattr(identification, "cut_ahead", lambda runs: [])
-    for name in ("Ahead", "Chain"):
-        monkeypatch.setattr(identification, name, lambda *given: SimpleNamespace(windows=[]))
-    monkeypatch.setattr(identification, "replace", lambda found, ranking: found)
-
-    def rounds(self, setting, trajectory, first, rival=None):
-        self.looked, self.sets, self.smoother.noise = self.looked + 1, [setting], setting
-        return SimpleNamespace(fitted=SimpleNamespace(setting={"found": 1}), name=next(ends))
-
-    other = SimpleNamespace(setting={search.world.candidates[0]: (1.0,)})
-    monkeypatch.setattr(Identification, "_rounds", rounds)
-    monkeypatch.setattr(search, "_elsewhere", lambda found: [other])
-    end = lambda self, again, found: again if better else None
-    monkeypatch.setattr(Identification, "_better_end", end)
-    assert search.run().name == ("second search" if better else "first search")
-    kept = other.setting if better else {}
-    assert search.looked == 41.0 + better and search.sets == [kept]
-    assert search.smoother.noise == kept
-
-
-class Located:
-    """A Smoother that locates nothing."""
-
-    position_noise = scale = noise = None
-
-    def locate(self, *given, **how):
-        return SimpleNamespace(located=lambda: [None], qpos=None, qvel=None, force=None)
+    found = search._rounds({}, "located", "first")
+    assert asked == [{}, best.setting] and found.fitted is best
+    assert (found.trajectory, found.first) == ("moved", "first")
 
 
 def test_what_finer_steps_explain_as_well_is_no_physics(search, monkeypatch):
+    """Finer steps stand for it, where they are earned."""
     now, armature = fitted(search, [], 0.0), fitted(search, ["armature"], -1.0)
     fine = fitted(search, [], -1.5)
     monkeypatch.setattr(search, "further", lambda judge, best: best)
     monkeypatch.setattr(search, "pruned", lambda judge, best, now: best)
     monkeypatch.setattr(search, "finer", lambda judge, best: fine if best is now else best)
-    assert search._ended(None, armature, now) is now
+    assert search._ended(None, armature, now) is fine
+    assert search._ended(None, now, now) is fine
     fine.loss, fine.score = now.loss, now.score  # finer steps explain nothing
     assert search._ended(None, armature, now) is armature
-    step = SimpleNamespace(setting={search.world.candidate("time_step", "world"): ()}, loss=-1.0)
-    assert search._ended(None, step, now) is step
+    assert search._ended(None, now, now) is now
+
+
+def test_a_finer_time_step_is_no_candidate_beside_others(search):
+    assert search.world.candidate("time_step", "world") not in search.candidates
+    assert any(c.effect.name == "gravity" for c in search.candidates)
 
 
 def test_beside_limits_that_small_changes_do_not_tell_of_the_others_are_tried_too(

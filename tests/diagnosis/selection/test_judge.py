@@ -75,17 +75,6 @@ def test_friction_and_gain_are_recovered_from_afar():
     assert paired(half.score, fitted.score).p_value < 1e-4
 
 
-def test_sets_that_explain_alike_leave_alike():
-    """Of a machine with a weak drive and too little damping, a back-EMF leaves what a damping does,
-    and a gain something else."""
-    judge = judge_of(damping=0.12, gear=0.7)
-    one = lambda name, place: judge.fit({judge.ahead.world.candidate(name, place): (0.1,)}).left
-    damping, back_emf = one("viscous_damping", "pivot"), one("back_emf", "drive")
-    assert np.linalg.norm(damping) == pytest.approx(1.0)
-    assert damping @ back_emf > 0.99
-    assert abs(damping @ one("gain", "drive")) < 0.8
-
-
 def test_a_stop_that_had_one_side_may_have_another_one_later():
     """What one side alone does not show may show with other values."""
     low, high = -0.5, 0.6
