@@ -36,7 +36,7 @@ from common import Recording  # noqa: E402
 from fields import fields  # noqa: E402
 
 from diagnosis.common.atomic_files import write_table, write_whole  # noqa: E402
-from diagnosis.estimation import prediction_error, windowing  # noqa: E402
+from diagnosis.estimation import windowing  # noqa: E402
 from diagnosis.handover import Files  # noqa: E402
 from diagnosis.nominal.model import load_world  # noqa: E402
 from diagnosis.recordings import recording as recorded  # noqa: E402
@@ -143,7 +143,7 @@ def loaded(folder):
 def errors(rig, files):
     """{unit: RMS error} over all numbers of a unit of the held-out recordings."""
     model = rig.world.model
-    windows = prediction_error.consecutive(recorded.load(rig.held, model), windowing.HORIZON)
+    windows = windowing.cut(recorded.load(rig.held, model), windowing.HORIZON)
     gap, known = windowing.gaps(model, windows, files.predicted(model, windows))
     unit = np.full(model.nv, "rad")
     for j, kind, _, v in windowing.joint_slices(model):

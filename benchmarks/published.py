@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT))
 
 from diagnosis.command import diagnose  # noqa: E402
 from diagnosis.common.atomic_files import write_table  # noqa: E402
-from diagnosis.estimation import prediction_error, windowing  # noqa: E402
+from diagnosis.estimation import windowing  # noqa: E402
 
 CSV = ROOT / "results" / "published.csv"
 COLUMNS = ("rig", "model", "window", "channel", "nominal", "published", "diagnosed")
@@ -54,13 +54,13 @@ def rows_of(folder, rig, model, span, published):
         print(f"{rig}: not here, skipped")
         return []
     found = diagnose(folder / rig / model, train, held)
-    world, windows = found.world, prediction_error.consecutive(found.held_out, span)
+    world, windows = found.world, windowing.cut(found.held_out, span)
     known = {world.candidate(*key): (value,) for key, value in published.items()}
     errors = [
         windowing.error(
             world.model,
             windows,
-            prediction_error.predict(world, settings, windows)[0],
+            windowing.predict(world, settings, windows)[0],
             np.ones(world.model.nv),
         )[1]
         for settings in ({}, known, found.settings)

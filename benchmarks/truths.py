@@ -21,8 +21,8 @@ import numpy as np  # noqa: E402
 from benchmarks.development import choice, chosen, place  # noqa: E402
 from benchmarks.rows import append, finished  # noqa: E402
 from diagnosis.preparation import prepared  # noqa: E402
-from diagnosis.selection.adequacy import lacking, share_left  # noqa: E402
 from diagnosis.selection.identification import Identification  # noqa: E402
+from diagnosis.selection.judge import lacking, share_left  # noqa: E402
 from diagnosis.trials.kept import BENCH, read_answer  # noqa: E402
 
 

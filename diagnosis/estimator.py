@@ -17,11 +17,9 @@ from diagnosis.estimation.intervals import intervals
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
-from diagnosis.selection import rivals, transients, unmodelled_force
-from diagnosis.selection.adequacy import channel, lacking, share_left
+from diagnosis.selection import missing_force, rivals, transients
 from diagnosis.selection.conditions import concentrated
 from diagnosis.selection.criterion import PRICE, complexity, paired
-from diagnosis.selection.event import Event
 from diagnosis.selection.identification import (
     LEVEL,
     Found,
@@ -29,8 +27,9 @@ from diagnosis.selection.identification import (
     physics,
     said,
 )
-from diagnosis.selection.judge import Fitted, changing, without
+from diagnosis.selection.judge import Fitted, changing, channel, lacking, share_left, without
 from diagnosis.selection.plausibility import plausible
+from diagnosis.selection.transients import Event
 from diagnosis.unnamed import NEAREST, UNNAMED
 
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
@@ -137,12 +136,12 @@ def _earned(search, judge, fitted):
 def _checked(search, found, fitted, others, log):
     """The Outcome so far: curves tried beside the names, and what is left."""
     world, train, judge = search.world, search.train, found.judge
-    dependences = unmodelled_force.dependences(world, found.first, train, most=None)
+    dependences = missing_force.dependences(world, found.first, train)
     trajectory = found.trajectory
-    left = unmodelled_force.dependences(world, trajectory, train, most=None)
+    left = missing_force.dependences(world, trajectory, train)
     shares = share_left(fitted) if fitted.setting else None
     finer = None  # what finer steps explain as well is no force
-    for rest in unmodelled_force.each_joint(left)[:2]:
+    for rest in missing_force.each_joint(left)[:2]:
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         dof = world.model.joint(rest.joint).dofadr[0]
         if mine and not shares[channel(fitted, dof)] > NEAREST:
@@ -166,7 +165,7 @@ def _instead(search, found, fitted, names, joint):
     names there, or None where that is no better."""
     rest = {c: v for c, v in fitted.setting.items() if c not in names}
     trajectory = copy(found.smoother).locate(rest, found.trajectory, passes=1)
-    follows = unmodelled_force.dependences(search.world, trajectory, search.train, most=None)
+    follows = missing_force.dependences(search.world, trajectory, search.train)
     curve = next((d for d in follows if d.joint == joint), None)
     if not curve:
         return None
@@ -242,9 +241,7 @@ def _nameless(search, outcome):
     if finer is not outcome.fitted:
         trajectory = copy(outcome.found.smoother).locate(finer.setting, trajectory, passes=1)
     if where or finer is not outcome.fitted:
-        outcome.left = unmodelled_force.dependences(
-            search.world, trajectory, search.train, most=None, rows=rows
-        )
+        outcome.left = missing_force.dependences(search.world, trajectory, search.train, rows=rows)
 
 
 def _beside(search, judge, fitted, rest, price):
@@ -318,9 +315,7 @@ def _hand_over(search, held, kept_back, outcome, log):
         outcome.strains[c] = _strain(c, v, plausible(c, found.usual))
     if set(kept) != set(found.fitted.setting):
         outcome.trajectory = found.smoother.locate(kept, outcome.trajectory, passes=1)
-        outcome.left = unmodelled_force.dependences(
-            world, outcome.trajectory, search.train, most=None
-        )
+        outcome.left = missing_force.dependences(world, outcome.trajectory, search.train)
     check.locate(kept)
     outcome.held_check = check
     smoother = found.smoother

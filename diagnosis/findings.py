@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diagnosis.effects.base import is_numerical
-from diagnosis.estimation import prediction_error, windowing
+from diagnosis.estimation import windowing
 from diagnosis.estimation.intervals import intervals
 from diagnosis.handover import Handed
 from diagnosis.selection import sensor_faults
-from diagnosis.selection.unmodelled_force import each_joint
+from diagnosis.selection.missing_force import each_joint
 from diagnosis.unnamed import depends_on, led
 
 SCATTER = 2.0  # standard deviations of a perfect simulator's squared error, that are nothing
@@ -48,7 +48,7 @@ def assemble(world, train, held_out, outcome):
     figures["held_out"] = _figure(world, handed, outcome.held_check, settings)
     figures["held_out"]["horizon_s"] = windowing.HORIZON
     check = outcome.held_check
-    figures["held_out"]["curve"] = prediction_error.curve(
+    figures["held_out"]["curve"] = windowing.curve(
         world, settings, check.smoother, check.trajectory, check.noise
     )
     if others := sensor_faults.errors(world, settings, check.recordings):
@@ -80,7 +80,7 @@ def assemble(world, train, held_out, outcome):
         world,
         settings,
         _ranking(outcome),
-        prediction_error.traces(world, settings, check.recordings),
+        windowing.traces(world, settings, check.recordings),
         train,
         held_out,
         located(world, outcome),
@@ -234,7 +234,7 @@ def _figure(world, handed: Handed, check, settings):
         out[name], per_channel = check.errors(files)
         for channel, value in per_channel.items():
             channels.setdefault(channel, {})[name] = value
-    out["floor"], per_channel, check.scatter = prediction_error.floor_error(
+    out["floor"], per_channel, check.scatter = windowing.floor_error(
         world, settings, check.smoother, check.trajectory, check.noise
     )
     for channel, value in per_channel.items():

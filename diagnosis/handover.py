@@ -13,8 +13,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from diagnosis.estimation import prediction_error, stock, windowing
+from diagnosis.estimation import windowing
 from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predictions, python_parts
+from diagnosis.simulation.editable_model import FILTERS
 
 SCATTER = 2.0  # standard deviations that are taken for chance
 
@@ -39,7 +40,7 @@ class Files:
     def predicted(self, nominal, windows):
         """qpos (W, T, nq) of windows, by stock MuJoCo and the script; NaN where there is none."""
         if not self.python:
-            return stock.predicted(stock.compiled(self.xml), nominal, windows)
+            return in_stock_mujoco(compiled(self.xml), nominal, windows)
         out, filled = np.full(windowing.measured(windows).shape, np.nan), {}
         for r in windowing.recordings_of(windows):  # where a window begins in a hole
             qpos, qvel = windowing.states(nominal, r)
@@ -73,8 +74,8 @@ class Check:
     def __init__(self, world, recordings, smoother, noise):
         """noise (nv,): of positions, as it is reported, whatever these recordings alone show."""
         self.world, self.recordings, self.smoother = world, recordings, smoother
-        self.windows = prediction_error.consecutive(recordings, windowing.HORIZON)
-        self.noise, self.told = prediction_error.reporting_noise(noise), np.isfinite(noise)
+        self.windows = windowing.cut(recordings, windowing.HORIZON)
+        self.noise, self.told = windowing.reporting_noise(noise), np.isfinite(noise)
         self.trajectory, self.scatter, self.path = None, 0.0, None
 
     def locate(self, setting):
@@ -168,3 +169,72 @@ def _worse(squares, others, uncounted=0):
     more = np.sort(np.where(both, 0.0, squares - np.where(both, 0.0, others)), axis=1)
     more[more[:, -1] == np.inf] = np.inf  # other windows make up for none that does not run
     return float(more[:, : max(more.shape[1] - uncounted, 1)].sum(1).min())
+
+
+def compiled(xml):
+    """The MjModel of an MJCF string."""
+    return mujoco.MjSpec.from_string(xml).compile()
+
+
+def in_stock_mujoco(model, nominal, windows):
+    """qpos (W, T, nq) of windows that follow each other, each begun as recorded; NaN where there is
+    none.
+
+    Joints and actuators go by the nominal model's names; what the model appends, its actuators'
+    states and delayed controls run on through each recording.
+    """
+    q, v = addresses(nominal, model)
+    names = [nominal.actuator(a).name for a in range(nominal.nactuator)]
+    drives = np.array([model.actuator_ctrladr[model.actuator(n).id] for n in names], int)
+    inputs = nominal.actuator_ctrladr[: nominal.nactuator]
+    measured = windowing.measured(windows)
+    out = np.full(measured.shape, np.nan)
+    begun = windowing.recorded_starts(nominal, windows)
+    length = model.opt.timestep
+    for recording in windowing.recordings_of(windows):
+        mine = {w.first: k for k, w in enumerate(windows) if w.recording is recording}
+        last = max(windows[k].last for k in mine.values())
+        data, now, start = mujoco.MjData(model), None, 0
+        _hold(model, data, drives, np.nan_to_num(recording.ctrl[0, inputs]))
+        for row in range(last + 1):
+            if now is not None and row <= windows[now].last:
+                out[now, row - start] = data.qpos[q]
+            if row in mine:
+                now, start = mine[row], row
+                data.qpos[q], data.qvel[v] = begun[0][now], begun[1][now]
+                out[now, 0] = begun[0][now]
+            if row < last:
+                data.ctrl[drives] = np.nan_to_num(recording.ctrl[row, inputs])
+                gap = recording.time[row + 1] - recording.time[row]
+                count = max(1, round(gap / length))
+                model.opt.timestep = gap / count
+                mujoco.mj_step(model, data, nstep=count)
+    model.opt.timestep = length
+    return out
+
+
+def _hold(model, data, drives, control):
+    """What waits and what filters begin as after its first control held for long."""
+    data.ctrl[drives] = control
+    for a in range(model.nactuator):
+        if not model.actuator_ctrlnum[a]:
+            continue
+        u = model.actuator_ctrladr[a]
+        value = data.ctrl[u]
+        if model.actuator_ctrllimited[u]:
+            value = np.clip(value, *model.actuator_ctrlrange[u])
+        if model.actuator_delay[a] > 0:
+            past = -model.opt.timestep * np.arange(model.actuator_history[a, 0], 0, -1)
+            mujoco.mj_initCtrlHistory(model, data, a, past, np.full(len(past), value))
+        if model.actuator_actadr[a] >= 0 and model.actuator_dyntype[a] in FILTERS:
+            data.act[model.actuator_actadr[a]] = value
+
+
+def addresses(nominal, model):
+    """(qpos, dof) addresses in `model` of the nominal model's joints, by name."""
+    qpos, dof = [], []
+    for j, _, q, v in windowing.joint_slices(nominal):
+        joint = model.joint(nominal.joint(j).name)
+        qpos += range(joint.qposadr[0], joint.qposadr[0] + q.stop - q.start)
+        dof += range(joint.dofadr[0], joint.dofadr[0] + v.stop - v.start)
+    return np.array(qpos, int), np.array(dof, int)

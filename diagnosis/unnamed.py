@@ -12,11 +12,11 @@ import numpy as np
 from diagnosis.effects.base import HINGE, JOINT_TRANSMISSIONS, SLIDE, is_numerical
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation import windowing
-from diagnosis.selection.adequacy import channel, share_left
 from diagnosis.selection.criterion import BEYOND, PRICE
 from diagnosis.selection.identification import LEVEL
+from diagnosis.selection.judge import channel, share_left
+from diagnosis.selection.missing_force import ABOVE
 from diagnosis.selection.plausibility import at_limit, plausible
-from diagnosis.selection.unmodelled_force import ABOVE
 
 # of a joint's error that names leave beyond a perfect simulator's, from which they are the nearest
 NEAREST = 0.25

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from diagnosis.estimation import prediction_error, windowing
+from diagnosis.estimation import windowing
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import Window, World
 
@@ -283,8 +283,8 @@ NOISE = 5e-4
 
 def reported_error(world, setting, recordings, noise):
     """(error in noises, {channel: SI}) of a setting over windows as the contract has them."""
-    windows = prediction_error.consecutive(recordings, windowing.HORIZON)
-    predicted, _ = prediction_error.predict(world, setting, windows)
+    windows = windowing.cut(recordings, windowing.HORIZON)
+    predicted, _ = windowing.predict(world, setting, windows)
     return windowing.error(world.model, windows, predicted, noise)
 
 

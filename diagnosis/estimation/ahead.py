@@ -12,7 +12,6 @@ import numpy as np
 
 from diagnosis.effects.base import runge_kutta
 from diagnosis.estimation import windowing
-from diagnosis.estimation.prediction_error import consecutive
 from diagnosis.simulation.simulator import step_of
 
 HORIZONS = 0.1, 0.3, 1.0  # s: ends of the bands of time ahead that count alike
@@ -29,7 +28,7 @@ def cut_ahead(recordings, longest=HORIZONS[-1]):
     seconds = [r.time[-1] - r.time[r.start] for r in recordings]
     sample = windowing.sampling(recordings)
     longest = max(min(longest, sum(seconds) / FEWEST), LEAST * sample)
-    windows = consecutive(recordings, longest)
+    windows = windowing.cut(recordings, longest)
     return [windows[i] for i in windowing.evenly(len(windows), MOST)]
 
 
@@ -56,7 +55,7 @@ class Ahead:
         self.measured = windowing.measured(windows)
         self.known = windowing.known(self.model, windows)
         self.known[:, 0] = False
-        time = windowing.measured(windows, "time")
+        time = windowing.measured(windows, lambda recording: recording.time)
         self.seconds = time - time[:, :1]
         ends = np.nanmax(self.seconds) * np.array(HORIZONS) / HORIZONS[-1] * (1 + 1e-6)
         self.band = np.where(np.isnan(self.seconds), -1, np.searchsorted(ends, self.seconds))

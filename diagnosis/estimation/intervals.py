@@ -1,14 +1,12 @@
 """95 % intervals that allow for dependence within groups, for few groups, and for the time step.
 
 bounds = intervals(fitted)          # {candidate: [(low, high) or None, ...]}
-line = one_number(gram, score)      # of one parameter, in closed form
+value, half, p = one_number(gram, score)      # of one parameter, in closed form
 
 The sandwich between groups with Bell and McCaffrey's correction (CR2) and Satterthwaite's degrees
 of freedom; Bell and McCaffrey, Survey Methodology 28 (2002); Pustejovsky and Tipton, Journal of
 Business and Economic Statistics 36 (2018).
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -123,24 +121,16 @@ def _curvature(slopes, weight, root):
     return (vectors * np.clip(values, FLAT, None)) @ vectors.T
 
 
-class Line(NamedTuple):
-    """value that removes most; half: half width of its 95 % interval; p_value: that it is 0."""
-
-    value: float
-    half: float
-    p_value: float
-
-
 def one_number(gram, score):
-    """The Line through groups' sums of slope² gram (G,) and slope · residual score (G,); p_value 1
-    and no width where too few groups see anything."""
+    """(value that removes most, half width of its 95 % interval, p-value that it is 0) of groups'
+    sums of slope² gram (G,) and slope · residual score (G,); endless, 1 where too few see any."""
     gram, score = gram[gram > 0], score[gram > 0]
     if len(gram) < FEWEST:
-        return Line(0.0, np.inf, 1.0)
+        return 0.0, np.inf, 1.0
     total = gram.sum()
     share, value = gram / total, score.sum() / total
     left = (score - gram * value) / np.sqrt(np.clip(1 - share, 0.05, 1.0))
     error = np.sqrt((left**2).sum()) / total
     freedom = max(1 / (share**2).sum() - 1, 1.0)
     chance = 2 * t_sf(abs(value) / max(error, 1e-300), freedom)
-    return Line(float(value), float(t_ppf(0.975, freedom) * error), float(chance))
+    return float(value), float(t_ppf(0.975, freedom) * error), float(chance)

@@ -16,17 +16,15 @@ ROUNDING = 1e-12  # share added to variances: noise far smaller than these would
 class Smoothed:
     """state (T, blocks, n), variance (T, blocks, n) of each component; for the variances' updates
     process, measurement: pairs (sum of squares, what that would be at the likelihood's optimum),
-    (n,) or (m,); likelihood: its log summed over blocks. gains, what is done with errors:
-    (transition (T, blocks, n, n); what measuring leaves (T, blocks, n, n); precision (T, blocks, m,
-    m) of measured less predicted, 0 of what is not measured; variance (T, blocks, n, n) of
-    predicted states).
+    (n,) or (m,). gains, what is done with errors: (transition (T, blocks, n, n); what measuring
+    leaves (T, blocks, n, n); precision (T, blocks, m, m) of measured less predicted, 0 of what is
+    not measured; variance (T, blocks, n, n) of predicted states).
     """
 
     state: np.ndarray
     variance: np.ndarray
     process: tuple
     measurement: tuple
-    likelihood: float
     gains: tuple
 
 
@@ -41,7 +39,7 @@ def smooth(A, c, Q, y, R, start, spread, counts=None):
     m = y.shape[-1]
     known = np.isfinite(y)
     filtered = _forward(A, c, Q, np.where(known, y, 0.0), known, R, start, spread)
-    predicted, P, K, Finv, error, likelihood = filtered
+    predicted, P, K, Finv, error = filtered
     keep = np.broadcast_to(np.eye(c.shape[-1]), P.shape).copy()
     keep[..., :m] -= K
     pushed = _times(Finv, error)
@@ -52,8 +50,7 @@ def smooth(A, c, Q, y, R, start, spread, counts=None):
     u = pushed - _times(np.swapaxes(K, -1, -2), behind)
     told = known if counts is None else known & counts[..., None]
     measurement = (u**2 * told).sum((0, 1)), (D * told).sum((0, 1))
-    scores = process, measurement, likelihood
-    return Smoothed(state, np.maximum(variance, 0.0), *scores, (A, keep, Finv, P))
+    return Smoothed(state, np.maximum(variance, 0.0), process, measurement, (A, keep, Finv, P))
 
 
 def _backward(A, keep, pushed, P, K, Finv):
@@ -84,27 +81,25 @@ def _times(matrices, vectors):
 
 def _forward(A, c, Q, y, known, R, start, spread):
     """Predicted states and covariances, gains (T, b, n, m), F^-1 (T, b, m, m) with 0 for what is
-    not measured, errors, and the log-likelihood."""
+    not measured, and errors."""
     T, b, n = c.shape
     m = y.shape[-1]
     x, P = start, np.einsum("bi,ij->bij", spread, np.eye(n))
     xs, Ps, gains = np.empty((T, b, n)), np.empty((T, b, n, n)), np.empty((T, b, n, m))
-    errors, Fs, inverses = np.empty((T, b, m)), np.empty((T, b, m, m)), np.empty((T, b, m, m))
+    errors, inverses = np.empty((T, b, m)), np.empty((T, b, m, m))
     pair, noise = known[..., None] & known[..., None, :], np.diag(R)
     for t in range(T):
         xs[t], Ps[t] = x, P
-        Fs[t] = np.where(pair[t], P[:, :m, :m] + noise, np.eye(m))
-        Fs[t][:, range(m), range(m)] *= 1 + ROUNDING
-        inverses[t] = np.linalg.inv(Fs[t])
+        F = np.where(pair[t], P[:, :m, :m] + noise, np.eye(m))
+        F[:, range(m), range(m)] *= 1 + ROUNDING
+        inverses[t] = np.linalg.inv(F)
         errors[t] = (y[t] - x[:, :m]) * known[t]
         gains[t] = P[:, :, :m] @ (inverses[t] * pair[t])
         x = _times(A[t], x + _times(gains[t], errors[t])) + c[t]
         P = A[t] @ (P - gains[t] @ P[:, :m]) @ A[t].transpose(0, 2, 1)
         P[:, range(n), range(n)] += Q[t]
         P = (P + np.swapaxes(P, -1, -2)) / 2
-    squares = errors * _times(inverses, errors)
-    likelihood = -0.5 * (np.linalg.slogdet(Fs)[1].sum() + squares.sum())
-    return xs, Ps, gains, inverses * pair, errors, float(likelihood)
+    return xs, Ps, gains, inverses * pair, errors
 
 
 class Response:

@@ -7,19 +7,21 @@ trajectory.force, trajectory.force_sd         # (rows, nv)
 
 x' = f(x, u) + B w with w a random walk in every joint, y = x + noise; Gauss-Newton around a Kalman
 smoother over blocks of rows. Variances of w and of the noise by maximum likelihood, the noise not
-below what differences of the recordings show.
+below what differences of the recordings show. Where something touches, no smooth map tells of a
+force.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from diagnosis.effects.base import HINGE, SLIDE
+from diagnosis.effects.environment import collides
 from diagnosis.estimation import windowing
 from diagnosis.estimation.kalman import Response, smooth
-from diagnosis.estimation.noise import measurement_noise
-from diagnosis.estimation.readings import behind, later, shown
-from diagnosis.estimation.touching import touching
+from diagnosis.estimation.readings import behind, later, measurement_noise, shown
 from diagnosis.simulation.rows import RowMap
 
 BLOCK, LEAD = 200, 40  # rows that are smoothed as one piece, and beside them on either side
@@ -94,10 +96,8 @@ class Smoother:
         self.first = dict(zip(self.recordings, (int(a) for a in starts[:-1])))
         states = [windowing.states(model, r) for r in recordings]
         self.qpos, self.qvel = (np.concatenate(x) for x in zip(*states))
-        measured_q = np.concatenate([r.qpos for r in recordings])
-        self.position = windowing.difference(
-            model, self.qpos, np.where(np.isfinite(measured_q), self.qpos, np.nan)
-        )
+        read = np.isfinite(np.concatenate([r.qpos for r in recordings]))
+        self.position = windowing.difference(model, self.qpos, np.where(read, self.qpos, np.nan))
         self.velocity = np.concatenate([_measured_velocity(model, r) for r in recordings])
         self._blocks(starts)
         self.floor = self._floors(recordings)
@@ -126,16 +126,14 @@ class Smoother:
     def _floors(self, recordings):
         position, velocity = measurement_noise(self.model, recordings)
         floor = np.concatenate([position, velocity])
-        self.told = np.isfinite(floor)  # channels of which there is enough to tell their noise
         known = np.isfinite(np.concatenate([self.position, self.velocity], 1)).any(0)
-        still = np.where(known, STILL, 1.0)
-        return np.where(self.told, np.maximum(floor, 1e-12), still) ** 2
+        told, still = np.isfinite(floor), np.where(known, STILL, 1.0)
+        self.told = told & known  # channels of which there is enough to tell their noise
+        return np.where(told, np.maximum(floor, 1e-12), still) ** 2
 
     def _noise(self):
-        nv, out = self.model.nv, np.sqrt(self.R)
-        known = np.isfinite(np.concatenate([self.position, self.velocity], 1)).any(0)
-        out = np.where(known & self.told, out, np.inf)
-        return windowing.pooled(self.model, out[:nv]), windowing.pooled(self.model, out[nv:])
+        out = np.where(self.told, np.sqrt(self.R), np.inf)
+        return [windowing.pooled(self.model, x) for x in np.split(out, 2)]
 
     def _scale(self):
         """Usual generalized force in each dof (nv,): what holds it and what turns it round in 0.2
@@ -163,7 +161,9 @@ class Smoother:
             qpos, qvel, force = trajectory.qpos, trajectory.qvel, trajectory.force
         off = self.model, setting, self.recordings
         qpos, qvel = behind(*off, qpos, qvel)
-        seen = self._seen(off)
+        # of the motion behind what the recordings show, and as far as that was measured
+        told = (later(*off, x) for x in (self.position, self.velocity))
+        seen = *behind(*off, self.qpos, self.qvel), *told
         qpos_sd = np.sqrt(self.R[: self.model.nv]) if trajectory is None else trajectory.qpos_sd
         for _ in range(passes):
             free = touching(self.model, qpos, REACH * qpos_sd)
@@ -187,12 +187,6 @@ class Smoother:
         split = np.split(transition, [2 * nv], axis=2)
         args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
         return Trajectory(*args, Response(found.gains, self.index, self.own))
-
-    def _seen(self, off):
-        """(qpos, qvel, and both as far as they were measured, NaN elsewhere) of the motion behind
-        what the recordings show."""
-        qpos, qvel = behind(*off, self.qpos, self.qvel)
-        return qpos, qvel, later(*off, self.position), later(*off, self.velocity)
 
     def _linear(self, rows, qpos, qvel, force, free, like=None):
         """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a
@@ -269,3 +263,46 @@ def _measured_velocity(model, recording):
         if quality and windowing.joint_name(model, j) in quality.differenced:
             qvel[:, v] = np.nan
     return qvel
+
+
+def touching(model, qpos, reach):
+    """Rows (N,) of positions (N, nq) at or after which something touches, or a joint lies at the
+    end of its travel. reach (nv,) or (N, nv): how far each coordinate may be off."""
+    reach = np.broadcast_to(reach, (len(qpos), model.nv))
+    ends = (model.jnt_limited != 0) & np.isin(model.jnt_type, (HINGE, SLIDE))
+    at, off = qpos[:, model.jnt_qposadr[ends]], reach[:, model.jnt_dofadr[ends]]
+    low, high = model.jnt_range[ends].T
+    touch = ((at < low + off) | (at > high - off)).any(1)
+    if collides(model):
+        touch |= _near(model, qpos, reach)
+    return touch | np.append(touch[1:], False)
+
+
+def _near(model, qpos, reach):
+    """Rows (N,) in which a contact may be made, as far as its distance is known."""
+    wide = copy(model)  # which finds contacts before they are made
+    most = np.linalg.norm(reach, axis=1).max(initial=0.0) * max(model.stat.extent, 1.0)
+    wide.geom_margin[:] += most / 2  # those of two that touch are summed
+    wide.flex_margin[:] += most / 2
+    wide.pair_margin[:] += most
+    data, out = mujoco.MjData(wide), np.zeros(len(qpos), bool)
+    for row, (q, off) in enumerate(zip(qpos, reach)):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(wide, data)
+        mujoco.mj_comPos(wide, data)
+        mujoco.mj_collision(wide, data)
+        gaps = ((c, c.dist - c.includemargin + most) for c in data.contact)
+        out[row] = any(gap < _off(model, data, c, off) for c, gap in gaps)
+    return out
+
+
+def _off(model, data, contact, reach):
+    """How far a contact's distance, m, may be off where coordinates are by reach (nv,),
+    independently; 0 of flexible bodies."""
+    if min(contact.geom) < 0:
+        return 0.0
+    slope, jacobian = np.zeros(model.nv), np.empty((3, model.nv))
+    for sign, body in zip((-1.0, 1.0), model.geom_bodyid[contact.geom]):
+        mujoco.mj_jac(model, data, jacobian, None, contact.pos, body)
+        slope += sign * contact.frame[:3] @ jacobian
+    return float(np.linalg.norm(slope * reach))

@@ -1,5 +1,6 @@
 """A beam over sets of effects on one matrix of sums: the sets worth a refit in the simulator.
 
+starts = likely(missing, starts)        # in a first look, those worth a column in every window
 start, nodes = Beam(columns, evidence).nodes()
 """
 
@@ -8,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diagnosis.effects.unmodelled import Unknown
+from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import PRICE, Score, complexity, paired
 from diagnosis.selection.judge import moved_setting, problem
 from diagnosis.selection.plausibility import cost
@@ -16,27 +18,19 @@ WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in 
 DEPTH = 4  # effects added in one round
 CHANCE = 0.05  # that forces speak against an effect by accident
 LEAST = 0.01  # loss that an effect must remove in the search
+GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
+MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; new ones in each
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Node:
     """A set of options beside those of the effects that are in the model already."""
 
     options: tuple
     score: Score
-    cost: float  # of its values
-    price: float  # of its complexity
+    unpriced: float  # what the search goes by: a price paid early hides what two do together
+    loss: float  # with the price of its complexity, what sets are ranked by
     lacks: Score  # of the missing force, if that is asked
-
-    @property
-    def unpriced(self):
-        """What the search goes by: a price paid early hides what two effects do together."""
-        return self.score.loss + self.cost
-
-    @property
-    def loss(self):
-        """What sets are ranked by."""
-        return self.unpriced + self.price
 
 
 class Beam:
@@ -75,10 +69,11 @@ class Beam:
         setting = moved_setting(self.columns, score.amounts, options)
         chosen = [self.columns.options[k] for k in options]
         nats = sum(cost(o.candidate, setting[o.candidate], o.prior) for o in chosen)
-        price = PRICE * complexity(o.candidate for o in chosen)
+        unpriced = score.loss + nats / evidence.number
+        loss = unpriced + PRICE * complexity(o.candidate for o in chosen)
         asked = self.missing and evidence is self.evidence
         lacks = self.missing.at(index, score.amounts) if asked else None
-        return Node(options, score, nats / evidence.number, price, lacks)
+        return Node(options, score, unpriced, loss, lacks)
 
     def _against(self, node, new):
         """Whether what joined a node explains the motion, but by forces that speak against it."""
@@ -87,10 +82,10 @@ class Beam:
     def nodes(self):
         """(node of the model as it is, all nodes met, best first)."""
         start = self.node(self.kept)
-        met, beam, before = {self._key(start): start}, [start], np.inf
+        met, beam, before = {start: None}, [start], np.inf
         proposed = self._proposed(start)
         if proposed is not start and not self._against(start, proposed):
-            met[self._key(proposed)] = proposed
+            met[proposed] = None
             beam.append(proposed)
             self._reduced(proposed, start, met)
         for _ in range(DEPTH):
@@ -100,25 +95,21 @@ class Beam:
             beam = list(each.values())[:WIDTH]  # the best of each set of candidates
             for node in beam:
                 self._reduced(node, start, met)
-            best = min(node.loss for node in met.values())
+            best = min(node.loss for node in met)
             if best >= before:
                 break
             before = best
-        return start, sorted(met.values(), key=lambda n: n.loss)
+        return start, sorted(met, key=lambda n: n.loss)
 
     def ranking(self):
         """[(candidate, loss removed alone, p-value)], most first."""
         start, met, best = self.node(self.kept), {}, {}
         self._joined(start, met)
-        for node in sorted(met.values(), key=lambda n: n.loss):
+        for node in sorted(met, key=lambda n: n.loss):
             candidate = self.columns.options[node.options[-1]].candidate
             p = paired(start.score, node.score).p_value
             best.setdefault(candidate, (candidate, start.loss - node.loss, p))
         return list(best.values())
-
-    @staticmethod
-    def _key(node):
-        return tuple(sorted(node.options))
 
     def _joined(self, node, met):
         """[Node] of sets with one effect more than a node that are better; those that the missing
@@ -131,7 +122,7 @@ class Beam:
         for k, new in zip(further, self.nodes_of([(*node.options, k) for k in further])):
             if self._against(node, new):
                 continue
-            met[self._key(new)] = new
+            met[new] = None
             # of two that make up for each other neither is better alone
             better = first or new.unpriced < node.unpriced - LEAST
             if better and not self._unnamed(k):
@@ -166,7 +157,7 @@ class Beam:
             added, fewer = node.options[len(self.kept) :], []
             for less in self.nodes_of([[k for k in node.options if k != out] for out in added]):
                 if not self._against(start, less):
-                    met[self._key(less)] = less
+                    met[less] = None
                     fewer.append(less)
             less = min(fewer, key=lambda n: n.loss, default=node)
             if less.loss >= node.loss:
@@ -199,3 +190,73 @@ class Beam:
     def setting(self, node):
         """The setting {Candidate: values} of a node."""
         return moved_setting(self.columns, node.score.amounts, node.options)
+
+
+def likely(missing, starts):
+    """Of Starts, the best ones of those candidates that explain most alone, or beside the best, a
+    row ahead, or in short windows where no row tells or the motion mostly touches something. Kept
+    are the effects of the setting as well, and waves, which the located force has chosen."""
+    chain, setting = missing.chain, missing.setting
+    chosen = lambda start: start.candidate in setting or start.merges
+    kept = [start for start in starts if chosen(start)]
+    new = [start for start in starts if not chosen(start)]
+    in_rows, in_windows, some = [], [], []
+    rounds = len(chain.channels) + MORE
+    for start in new:
+        (in_windows if chain.touches or chain.apart(start.candidate) else in_rows).append(start)
+    if in_rows:
+        bases = {start: missing.basis(start) for start in in_rows}
+        in_windows += [start for start in in_rows if bases[start] is None]
+        some = _by_rows(missing.force, {s: b for s, b in bases.items() if b is not None}, rounds)
+    if in_windows:
+        some += _by_windows(chain.beginnings(*GLANCES), setting, kept, in_windows, rounds)
+    return [*dict.fromkeys([*kept, *some])]  # a wave may be among the best in windows as well
+
+
+def _best(gains, kept):
+    """(the best of {Start: gain}, further Starts to be kept beside some): of the best candidates
+    that are not kept yet the best in proportion and the best of its whole values."""
+    order = sorted(gains, key=lambda start: -gains[start])
+    best, known = {}, {start.candidate for start in kept}
+    for start in order:
+        if start.candidate not in known:
+            best.setdefault(start.candidate, {}).setdefault(start.whole, start)
+    return order[0], [start for each in list(best.values())[:EACH] for start in each.values()]
+
+
+def _by_rows(target, bases, rounds):
+    """The Starts whose bases (n, dofs, p) explain most of a target (n, dofs)."""
+    kept, target = {}, target.ravel()
+    bases = {start: basis.reshape(len(target), -1) for start, basis in bases.items()}
+    for _ in range(rounds if bases else 0):
+        gains = {start: explained(basis, target) for start, basis in bases.items()}
+        best, further = _best(gains, kept)
+        kept |= dict.fromkeys(further)
+        beside = np.linalg.qr(bases[best])[0]
+        rest = lambda x: x - beside @ (beside.T @ x)
+        target, bases = rest(target), {start: rest(basis) for start, basis in bases.items()}
+    return list(kept)
+
+
+def _by_windows(short, setting, inside, starts, rounds):
+    """The Starts that gain most in the windows of a short Chain, beside those inside a setting."""
+    columns = Columns(short, setting, inside + starts)
+    beam = Beam(columns, columns.evidence())
+    node, kept = beam.node(beam.kept), {}
+    for _ in range(rounds):
+        others = beam.others(node)
+        # within the bounds of their amounts: a column tells of no values far from its own
+        grown = beam.nodes_of([(*node.options, k) for k in others])
+        gains = {columns.begun[k]: node.unpriced - new.unpriced for k, new in zip(others, grown)}
+        if not gains:
+            break
+        best, further = _best(gains, kept)
+        kept |= dict.fromkeys(further)
+        node = beam.node((*node.options, columns.begun.index(best)))
+    return list(kept)
+
+
+def explained(basis, target):
+    """Share of the squares of a target (n,) that columns (n, k) explain."""
+    left = target - basis @ np.linalg.lstsq(basis, target, rcond=None)[0]
+    return 1 - left @ left / (target @ target + 1e-300)

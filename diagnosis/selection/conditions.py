@@ -13,8 +13,8 @@ from diagnosis.common.distributions import f_sf
 from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND
 from diagnosis.selection.identification import LEVEL
+from diagnosis.selection.missing_force import dependences
 from diagnosis.selection.transients import CONCENTRATED, LONGEST, SHORTEST, STEADY
-from diagnosis.selection.unmodelled_force import dependences
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Condition:
         """The Dependence of the located force there, acting there only; None where it follows
         nothing."""
         rows = self.rows(recordings)
-        for found in dependences(world, trajectory, recordings, most=1, rows=rows):
+        for found in dependences(world, trajectory, recordings, rows=rows):
             return replace(found, candidate=world.localised(found.candidate, self.when))
         return None
 

@@ -166,16 +166,12 @@ class Evidence:
         shares = each / np.maximum(counting.sum(-2, keepdims=True), 1.0) / self.cells
         return each, shares
 
-    def _scored(self, square, amounts):
-        """The Score of mean squared errors (G, cells)."""
-        return self._summed(*self._logs(square), amounts)
-
     def each_channel(self, square):
         """[Score] of each channel alone, of mean squared errors (G, cells)."""
         parts = (np.split(x, self.channels, axis=1) for x in self._logs(square))
-        return [self._summed(*part, np.zeros(0)) for part in zip(*parts)]
+        return [self._scored(*part, np.zeros(0)) for part in zip(*parts)]
 
-    def _summed(self, each, shares, amounts):
+    def _scored(self, each, shares, amounts):
         """The Score of some cells, of what _logs() tells of them (G, some)."""
         groups = len(each) * shares.sum(1)
         return Score(float(groups.mean()), groups, each.sum(1), amounts, self.independent)
@@ -199,7 +195,7 @@ class Evidence:
 
     def at(self, columns, amounts):
         """Score of given amounts (p,) of columns (p,)."""
-        return self._scored(self.squares(columns, amounts), amounts)
+        return self._scored(*self._logs(self.squares(columns, amounts)), amounts)
 
     def score(self, columns, low, high, precision, pull):
         """Score of columns (p,) between bounds low, high (p,) of their amounts, under a quadratic
@@ -231,7 +227,7 @@ class Evidence:
         matrix, vector, low, high = (x[:, None] for x in prior)
         matrix, vector = rest[..., 1:, 1:] + matrix, rest[..., 1:, 0] + vector
         squares = self.square_of(products, bounded(matrix, vector, low, high))
-        return [self._scored(square, own) for square, own in zip(squares, amounts)]
+        return [self._scored(*self._logs(square), own) for square, own in zip(squares, amounts)]
 
     def _fitted(self, products, prior):
         """(Products, start states free, amounts (B, p), mean squares (B, G, cells)) of the lowest
@@ -254,10 +250,8 @@ class Evidence:
             loss = 0.5 * np.log(begun + self.floor)[:, self.count > 0].sum(-1) + cost
             found.append((loss, free.moved, amounts, begun))
         (first, *one), (second, *other) = found
-        lower = second < first
-        moved, amounts, square = (
-            np.where(lower.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(one, other)
-        )
+        lower = lambda a: (second < first).reshape(-1, *[1] * (a.ndim - 1))
+        moved, amounts, square = (np.where(lower(a), b, a) for a, b in zip(one, other))
         return replace(products, moved=moved), amounts, square
 
     def weighed(self, square):

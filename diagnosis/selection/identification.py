@@ -14,16 +14,13 @@ from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
-from diagnosis.selection.beam import LEAST, Beam
-from diagnosis.selection.columns import Columns
+from diagnosis.selection.beam import LEAST, Beam, likely
+from diagnosis.selection.columns import Columns, Starts
 from diagnosis.selection.criterion import Evidence, complexity, paired
-from diagnosis.selection.first_look import likely
 from diagnosis.selection.judge import Fitted, Judge, without
-from diagnosis.selection.missing_force import MissingForce
+from diagnosis.selection.missing_force import MissingForce, dependences
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.rivals import TIED, as_good, carried
-from diagnosis.selection.starts import Starts
-from diagnosis.selection.unmodelled_force import dependences
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
@@ -66,7 +63,24 @@ class Identification:
     def run(self, setting=None):
         """The Found of all rounds, begun with the nominal model, or with a setting."""
         setting = setting or {}
-        return self._rounds(setting, *self.locate(setting))
+        trajectory, first = self.locate(setting)
+        for i in range(ROUNDS):
+            self.begin(setting, trajectory)
+            self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
+            judge = self.judge()
+            fitted, better = self._round(setting, judge)
+            if not better:
+                break
+            setting = fitted.setting
+            trajectory = self.smoother.locate(setting, trajectory, passes=1)
+        else:  # rounds ended with a set from which nothing has begun
+            self.begin(setting, trajectory)
+            judge = self.judge()
+            self.missing = MissingForce(self.screen, setting, self.missing)
+            fitted = judge.fit(setting)
+            self.sets = carried(judge, self.sets, fitted, fitted)
+        known = trajectory, first, self.smoother, self.usual, judge
+        return Found(fitted, *known, self.missing, self.ranking, self.sets)
 
     def locate(self, setting):
         """(trajectory under a setting, trajectory under the nominal model), by which the windows
@@ -88,26 +102,6 @@ class Identification:
         self.ahead.start(trajectory, setting)
         self.screen.start(trajectory, setting)
         self.trajectory = trajectory
-
-    def _rounds(self, setting, trajectory, first):
-        """The Found of rounds begun with a setting, and the trajectory located under it."""
-        for i in range(ROUNDS):
-            self.begin(setting, trajectory)
-            self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
-            judge = self.judge()
-            fitted, better = self._round(setting, judge)
-            if not better:
-                break
-            setting = fitted.setting
-            trajectory = self.smoother.locate(setting, trajectory, passes=1)
-        else:  # rounds ended with a set from which nothing has begun
-            self.begin(setting, trajectory)
-            judge = self.judge()
-            self.missing = MissingForce(self.screen, setting, self.missing)
-            fitted = judge.fit(setting)
-            self.sets = carried(judge, self.sets, fitted, fitted)
-        known = trajectory, first, self.smoother, self.usual, judge
-        return Found(fitted, *known, self.missing, self.ranking, self.sets)
 
     def judge(self):
         """A Judge that compares with the nominal model: an effect has to remove something of what
@@ -180,7 +174,7 @@ class Identification:
         """[(candidate, values)] of forces without a name, in joints that no effect of a setting has
         for its place: beside one, every curve is significant, and its size decides in the end. What
         depends on the joint's own speed alone is friction of some kind: names are tried first."""
-        found = dependences(self.world, self.trajectory, self.train, most=None)
+        found = dependences(self.world, self.trajectory, self.train)
         joints = [self.world.joints(c.place) or () for c in setting]
         taken = {self.world.model.joint(j).name for some in joints for j in some}
         found = [d for d in found if d.variables != (f"velocity:{d.joint}",)]
@@ -270,9 +264,8 @@ class Identification:
         whole = fitted
         while len(fitted.setting) > 1:
             rest = lambda out: {c: v for c, v in fitted.setting.items() if c is not out}
-            tries = [
-                judge.fit(rest(out), steps=3, near=fitted) for out in self._missed_least(fitted)
-            ]
+            tries = [rest(out) for out in self._missed_least(fitted)]
+            tries = [judge.fit(setting, steps=3, near=fitted) for setting in tries]
             tries = [f for f in tries if self.earned(now, f)]
             less = min(tries, key=lambda f: f.loss, default=None)
             if less:
@@ -312,7 +305,5 @@ def squares(ahead, residual=None):
 
 def said(setting):
     """A set in one line."""
-    return ", ".join(
-        f"{c.effect.name} {c.place.name} " + " ".join(f"{x:.4g}" for x in v)
-        for c, v in setting.items()
-    )
+    numbers = lambda values: " ".join(f"{x:.4g}" for x in values)
+    return ", ".join(f"{c.effect.name} {c.place.name} {numbers(v)}" for c, v in setting.items())

@@ -3,17 +3,16 @@
 judge = Judge(ahead, usual)
 fitted = judge.fit({friction: (0.1,)})
 fitted.setting, fitted.loss
+share_left(fitted), lacking(fitted)      # of each channel, beside what a perfect simulator errs
 """
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from diagnosis.selection.columns import Columns
-from diagnosis.selection.criterion import PRICE, Evidence, Score, complexity
+from diagnosis.selection.columns import Columns, Starts
+from diagnosis.selection.criterion import BEYOND, PRICE, Evidence, Score, complexity, paired
 from diagnosis.selection.plausibility import at_limit, cost, plausible
-from diagnosis.selection.starts import Starts
 
 STEPS = 6  # Gauss-Newton steps of a refit, at most
 DONE = 2e-3  # loss that another step would still remove, from which on a refit is done
@@ -128,29 +127,21 @@ def problem(columns, chosen):
     return [i for o in options for i in o.columns], *map(np.concatenate, parts)
 
 
-class Left(NamedTuple):
-    """What is left of a Fitted set in a first look."""
-
-    score: Score
-    loss: float
-    setting: dict
-
-
 def without(fitted, candidate):
-    """Left when an effect of a Fitted set becomes nominal and the others move, as far as small
-    changes tell. Of a limit that there was not they tell nothing, so it is as if none missed it."""
+    """A Fitted set when an effect of it becomes nominal and the others move, as far as its columns
+    tell. Of a limit that there was not they tell nothing, so it is as if none missed it."""
     columns = fitted.columns
     index, low, high, precision, pull = problem(columns, range(len(columns.options)))
     away = np.array(candidate.nominal) - fitted.setting[candidate]
+    rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     for option in columns.options:
         if option.candidate is candidate:
             gone = [away[row != 0][0] / row[row != 0][0] for row in option.directions]
             if not np.isfinite(gone).all():
-                return Left(fitted.score, -np.inf, {})
+                return replace(fitted, setting=rest, score=replace(fitted.score, loss=-np.inf))
             low[list(option.columns)] = high[list(option.columns)] = gone
     score = fitted.evidence.score(index, low, high, precision, pull)
-    rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    return Left(score, score.loss + PRICE * complexity(rest), rest)
+    return replace(fitted, setting=rest, score=score)
 
 
 def changing(judge, fitted):
@@ -176,3 +167,43 @@ def moved_setting(columns, amounts, chosen=None):
         at += len(option.columns)
         moved[option.candidate] = tuple(float(x) for x in option.values(part))
     return moved
+
+
+def share_left(fitted):
+    """Share (channels,) of the nominal model's error that a Fitted set leaves, both beyond what a
+    perfect simulator errs; NaN where the nominal model hardly errs by more than that."""
+    evidence, seen = fitted.evidence, fitted.evidence.count > 0
+    floor = np.maximum(_perfect(fitted).square, evidence.noise**2)
+    each = lambda x: np.where(seen, x, 0.0).reshape(len(x), evidence.channels, -1).sum((0, 2))
+    excess = lambda x: each(np.maximum(x - floor, 0.0))
+    before, after = excess(evidence.reference), excess(evidence.square)
+    told = each(evidence.reference) > BEYOND**2 * each(floor)
+    return np.sqrt(after / np.where(told, before, np.nan))
+
+
+def channel(fitted, dof):
+    """Index of the channel that a degree of freedom belongs to."""
+    return [dof in dofs for dofs in fitted.columns.ahead.channels].index(True)
+
+
+def lacking(fitted):
+    """[Comparison] of each channel: what a perfect simulator would remove of the error of a Fitted
+    set, start states free."""
+    evidence = fitted.evidence
+    scores = map(evidence.each_channel, (evidence.square, _perfect(fitted).square))
+    return [paired(before, after) for before, after in zip(*scores)]
+
+
+def _perfect(fitted):
+    """The Evidence of windows drawn as if a set were true: begun at states as far off as the
+    smoother leaves them, and read with noise, as much louder, if at all, as the shortest
+    predictions err: a force that is missing hardly shows in them, noise that is not white does."""
+    ahead, evidence = fitted.columns.ahead, fitted.evidence
+    shortest = lambda x: x.reshape(len(x), evidence.channels, -1)[:, :, 0]
+    count, square, [noise] = map(shortest, (evidence.count, evidence.square, evidence.noise[None]))
+    mean = (count * square).sum(0) / np.maximum(count.sum(0), 1)
+    louder, rng = np.ones(ahead.model.nv), np.random.default_rng(0)
+    for dofs, times in zip(ahead.channels, mean / np.maximum(noise**2, 1e-300)):
+        louder[dofs] = np.sqrt(max(times, 1.0))
+    drawn = ahead.drawn(fitted.setting, fitted.columns.residual, louder, rng)
+    return Evidence(ahead, drawn, np.zeros((*drawn.shape, 0)), evidence.reference)

@@ -12,12 +12,11 @@ others = together(others, fitted, sets)
 import numpy as np
 
 from diagnosis.effects.unmodelled import Unknown
-from diagnosis.selection.columns import Columns
+from diagnosis.selection.beam import likely
+from diagnosis.selection.columns import Columns, Starts
 from diagnosis.selection.criterion import Evidence, complexity, paired
-from diagnosis.selection.first_look import likely
 from diagnosis.selection.judge import problem
 from diagnosis.selection.missing_force import MissingForce
-from diagnosis.selection.starts import Starts
 
 APART = 0.3  # share of an effect that another may leave in its place, as far as columns tell
 TIED = 0.1  # nats of log RMS error by which another member of a class may be worse
@@ -93,10 +92,8 @@ def _instead(rival, fitted):
     """(effects of one Fitted set, those of another one that they stand for), or None: where one is
     part of the other, a round has compared them. A curve is no name that others could have, and
     much more complex ones are no equals."""
-    new, gone = (
-        [c for c in a.setting if c not in b.setting and not c.effect.numerical]
-        for a, b in ((rival, fitted), (fitted, rival))
-    )
+    beside = lambda a, b: [c for c in a if c not in b and not c.effect.numerical]
+    new, gone = beside(rival.setting, fitted.setting), beside(fitted.setting, rival.setting)
     named = not any(isinstance(c.effect, Unknown) for c in new)
     alike = named and complexity(new) <= complexity(gone) + FURTHER
     return (new, gone) if alike and new and gone else None

@@ -7,8 +7,6 @@ Nothing is fitted to them but their own faults, and those only where one explain
 left, of sensors of motion: where forces differ it may be the model that is wrong.
 """
 
-from typing import NamedTuple
-
 import mujoco
 import numpy as np
 
@@ -16,9 +14,7 @@ from diagnosis.effects.base import SLIDE
 from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import neighbours
 from diagnosis.estimation.intervals import one_number
-from diagnosis.estimation.noise import difference_noise
-from diagnosis.estimation.prediction_error import consecutive
-from diagnosis.estimation.readings import behind
+from diagnosis.estimation.readings import behind, difference_noise
 from diagnosis.selection import transients
 from diagnosis.simulation.rows import RowMap
 
@@ -44,18 +40,6 @@ UNITS = {
 }
 
 
-class Tried(NamedTuple):
-    """A sensor's fault at a value, and sums over each group of neighbouring rows (G,)."""
-
-    candidate: object
-    value: float
-    gram: np.ndarray  # of the slope of the sensor's reading with the value
-    score: np.ndarray  # of that slope times what is left
-    left: np.ndarray  # squares of what it leaves of the measurements
-    bare: np.ndarray  # squares of what no fault leaves
-    rows: int
-
-
 def recorded(model, recordings):
     """[(name, columns of sensordata)] of the sensors that any of the recordings measured."""
     out = []
@@ -75,14 +59,9 @@ def unit(model, name):
     return told.replace("rad", "m") if slide else told
 
 
-def measured(windows, name, width):
-    """(W, T, width) recorded rows of a sensor; NaN where there are none, and at the last, whose
-    control belongs to what follows."""
-    out = np.full((len(windows), max(w.last - w.first + 1 for w in windows), width), np.nan)
-    for row, w in zip(out, windows):
-        if name in w.recording.sensors:
-            row[: w.last - w.first] = w.recording.sensors[name][w.first : w.last]
-    return out
+def read(recording, name, width):
+    """(T, width) of a sensor as recorded, NaN where it was not."""
+    return recording.sensors.get(name, np.full((len(recording.time), width), np.nan))
 
 
 def noise_of(recordings, name):
@@ -97,12 +76,14 @@ def errors(world, settings, recordings):
     known, out = recorded(world.model, recordings), {}
     if not known:
         return out
-    windows = consecutive(recordings, windowing.HORIZON)
+    windows = windowing.cut(recordings, windowing.HORIZON)
     begun = windowing.recorded_starts(world.model, windows)
-    run = lambda s: world.simulate([s] * len(windows), *begun, windows, sensors=True)[2][:, 1:]
+    run = lambda s: world.simulate([s] * len(windows), *begun, windows, sensors=True)[2][:, 1:-1]
+    whole = [w._replace(last=w.last - 1) for w in windows]  # the last control is what follows's
     predicted = {"before": run({}), "after": run(settings)}
     for name, columns in known:
-        seen = measured(windows, name, columns.stop - columns.start)[:, 1:]
+        width = columns.stop - columns.start
+        seen = windowing.measured(whole, lambda r: read(r, name, width))[:, 1:]
         here, found = np.isfinite(seen), {}
         if not here.any():
             continue
@@ -121,15 +102,31 @@ def faults(world, settings, train, trajectory, event=None):
     trajectory: of the recordings `train` under the settings: its states are right whatever the
     model lacks. event: in whose time nothing is looked for, or None."""
     known = [k for k in recorded(world.model, train) if unit(world.model, k[0]) in MOTION]
-    tried, out = _tried(world, settings, known, train, trajectory, event) if known else {}, []
-    for name, _ in known:
-        mine = sorted((t for (n, _), t in tried.items() if n == name), key=lambda t: t.left.sum())
-        found = [finding(world.model, t, noise_of(train, name), len(tried)) for t in mine]
-        if not found[0]:
-            continue
-        bound = (1 + SAME) ** 2 * mine[0].left.sum()
-        same = [f for f, t in zip(found[1:], mine[1:]) if f and t.left.sum() < bound]
-        out.append({**found[0], "also_possible": [_told(f) for f in same]})
+    if not known:
+        return []
+    shown, rows, out = readings(world, settings, train, trajectory), [], []
+    for r in train:
+        i = np.array([k for a, b in transients.quiet(r, event) for k in range(a, b)], int)
+        rows.append(i[(r.time[i] >= r.time[0] + LATE) & (i < len(r.time) - 1)])
+    group, tests = neighbours(sum(map(len, rows))), len(known) * len(FAULTS)
+    for name, columns in known:
+        width = columns.stop - columns.start
+        target = np.concatenate([read(r, name, width)[i] for r, i in zip(train, rows)])
+
+        def predict(measure):
+            (offset, ratio, delay), late = measure, []
+            for r, i, sensors in zip(train, rows, shown):
+                at = lambda x: np.interp(r.time[i] - delay, r.time, x)
+                late.append(np.apply_along_axis(at, 0, sensors[:, columns]))
+            return ratio * np.concatenate(late) + offset
+
+        fits = [_fitted(world.candidate(fault, name), predict, target, group) for fault in FAULTS]
+        fits.sort(key=lambda fit: fit[0])
+        best, *found = [finding(world.model, fit, noise_of(train, name), tests) for fit in fits]
+        if best:
+            bound = (1 + SAME) ** 2 * fits[0][0]
+            same = [_told(f) for f, fit in zip(found, fits[1:]) if f and fit[0] < bound]
+            out.append({**best, "also_possible": same})
     return out
 
 
@@ -140,36 +137,10 @@ def _told(finding):
     return {"effect": finding["effect"], "place": finding["place"], "parameters": parameters}
 
 
-def _tried(world, settings, known, recordings, trajectory, event):
-    """{(sensor, effect): Tried}, each fault fitted on its own."""
-    shown, out = readings(world, settings, recordings, trajectory), {}
-    rows = []
-    for r in recordings:
-        i = np.array([k for a, b in transients.quiet(r, event) for k in range(a, b)], int)
-        rows.append(i[(r.time[i] >= r.time[0] + LATE) & (i < len(r.time) - 1)])
-    group = neighbours(sum(map(len, rows)))
-    for name, columns in known:
-        none = np.full((1, columns.stop - columns.start), np.nan)
-        given = zip(recordings, rows)
-        target = np.concatenate(
-            [r.sensors[name][i] if name in r.sensors else none.repeat(len(i), 0) for r, i in given]
-        )
-
-        def predict(measure):
-            (offset, ratio, delay), late = measure, []
-            for r, i, sensors in zip(recordings, rows, shown):
-                at = lambda x: np.interp(r.time[i] - delay, r.time, x)
-                late.append(np.apply_along_axis(at, 0, sensors[:, columns]))
-            return ratio * np.concatenate(late) + offset
-
-        for effect in FAULTS:
-            out[name, effect] = _fitted(world.candidate(effect, name), predict, target, group)
-    return out
-
-
 def _fitted(candidate, predict, target, group):
-    """The Tried of a fault at the value that suits it. predict(measure): readings (n, k); target
-    (n, k); group (n,)."""
+    """(squares that a fault leaves at the value that suits it, those without one; rows, candidate,
+    value; sums by group (G,) of the squared slope of the readings with the value, and of that slope
+    times what is left). predict(measure): readings (n, k); target (n, k); group (n,)."""
     p, measure = candidate.parameters[0], candidate.effect.measure
     value, total = p.nominal, lambda x: np.bincount(group, np.where(here, x, 0.0).sum(1))
     for _ in range(TURNS):
@@ -180,7 +151,8 @@ def _fitted(candidate, predict, target, group):
         best, value = value, value + score.sum() / max(gram.sum(), 1e-300)
         value = float(np.clip(value, p.low, p.high))
     bare = target - predict(measure((p.nominal,)))
-    return Tried(candidate, best, gram, score, total(left**2), total(bare**2), here.sum())
+    squares = total(left**2).sum(), total(bare**2).sum()
+    return *squares, here.sum(), candidate, best, gram, score
 
 
 def readings(world, settings, recordings, trajectory):
@@ -200,27 +172,28 @@ def readings(world, settings, recordings, trajectory):
     return [np.concatenate([part, part[-1:]]) for part in np.split(out, ends)]
 
 
-def finding(model, tried, noise, tests):
-    """The finding of a sensor's fault, or None where it is not sure enough of so many tests."""
-    name, p = tried.candidate.place.name, tried.candidate.parameters[0]
-    left, bare = tried.left.sum(), tried.bare.sum()
-    if not bare - left > EXPLAINED * max(bare - tried.rows * noise**2, 0.2 * bare):
+def finding(model, fit, noise, tests):
+    """The finding of a sensor's fault, as it was fitted, or None where it is not sure enough of so
+    many tests."""
+    left, bare, rows, candidate, at, gram, score = fit
+    name, p = candidate.place.name, candidate.parameters[0]
+    if not bare - left > EXPLAINED * max(bare - rows * noise**2, 0.2 * bare):
         return None
     # as seen from the sound sensor, its slope taken as here
-    line = one_number(tried.gram, tried.score + tried.gram * (tried.value - p.nominal))
-    low, high = tried.value - line.half, tried.value + line.half
-    if line.p_value * tests > LEVEL or low <= p.nominal <= high:
+    _, half, chance = one_number(gram, score + gram * (at - p.nominal))
+    low, high = at - half, at + half
+    if chance * tests > LEVEL or low <= p.nominal <= high:
         return None
     size = unit(model, name) if p.unit == "sensor" else p.unit
-    value = {"name": p.name, "nominal": float(p.nominal), "value": tried.value, "unit": size}
+    value = {"name": p.name, "nominal": float(p.nominal), "value": at, "unit": size}
     return {
-        "effect": tried.candidate.effect.name,
+        "effect": candidate.effect.name,
         "place": {"kind": "sensor", "name": name},
         "parameters": [{**value, "low": max(low, p.low), "high": min(high, p.high)}],
         "evidence": {
             "held_out_error_removed": 0.0,
             "sensor_error_removed": float(1 - np.sqrt(left / bare)),
-            "p_value": min(line.p_value * tests, 1.0),
+            "p_value": min(chance * tests, 1.0),
         },
         "adequate": True,
         "strains": None,

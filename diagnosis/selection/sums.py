@@ -84,9 +84,8 @@ class Sums:
         # rows err alike where a model does: those of a cell count as few errors
         each = (1 / (square + floor))[..., self.group_of, :]
         weight = INDEPENDENT / np.maximum(self.rows, 1) * each
-        inside = np.einsum("...wc,wcij->...wij", weight, self.starts) + np.eye(
-            self.starts.shape[-1]
-        )
+        inside = np.einsum("...wc,wcij->...wij", weight, self.starts)
+        inside += np.eye(self.starts.shape[-1])
         return np.linalg.solve(inside, np.einsum("...wc,...wcip->...wip", weight, crossed))
 
 

@@ -20,7 +20,7 @@ from plants import reported_error
 
 from diagnosis import command as diagnose
 from diagnosis import preparation
-from diagnosis.estimation import prediction_error
+from diagnosis.estimation import windowing
 from diagnosis.recordings.recording import Recording, RecordingError, accepted
 from diagnosis.report import text as wording
 from diagnosis.simulation.simulator import World
@@ -136,9 +136,9 @@ def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
     [early], [tail] = preparation.split([whole])
     world = World(mujoco.MjSpec.from_string(INTEGRATOR))
     error, _ = reported_error(world, {}, [tail], np.ones(1))
-    assert error < 1e-6 and len(prediction_error.consecutive([tail], 0.3)) == 2
+    assert error < 1e-6 and len(windowing.cut([tail], 0.3)) == 2
     assert reported_error(world, {}, [tail.seen()], np.ones(1))[0] > 0.1
-    (trace,) = prediction_error.traces(world, {}, [tail])
+    (trace,) = windowing.traces(world, {}, [tail])
     assert trace["time"][0] == tail.time[tail.start] > early.time[-1]
 
 

@@ -199,8 +199,8 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
     condition = SimpleNamespace(rows=lambda train: rows) if where else None
     monkeypatch.setattr(estimator, "lacking", lambda fitted: fitted.setting)
     monkeypatch.setattr(estimator, "concentrated", lambda fitted: condition)
-    told = lambda world, trajectory, train, most, rows: (trajectory, rows)
-    monkeypatch.setattr(estimator.unmodelled_force, "dependences", told)
+    told = lambda world, trajectory, train, rows: (trajectory, rows)
+    monkeypatch.setattr(estimator.missing_force, "dependences", told)
     locate = lambda setting, near, passes: f"{near} in {setting}"
     found = SimpleNamespace(judge=None, smoother=SimpleNamespace(locate=locate))
     fitted = SimpleNamespace(setting="usual steps")

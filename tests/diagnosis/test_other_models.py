@@ -8,7 +8,7 @@ import pytest
 from diagnosis import command as diagnose
 from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import Ahead, cut_ahead
-from diagnosis.estimation.noise import difference_noise, measurement_noise
+from diagnosis.estimation.readings import difference_noise, measurement_noise
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings import recording
 from diagnosis.recordings.inverse_dynamics import course_of

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from plants import DRIVEN_PENDULUM, recorded
 
-from diagnosis.estimation.noise import difference_noise, measurement_noise
+from diagnosis.estimation.readings import difference_noise, measurement_noise
 
 RNG = np.random.default_rng
 

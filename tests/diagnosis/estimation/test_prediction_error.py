@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from plants import DRIVEN_PENDULUM, NOISE, recorded, reported_error
 
-from diagnosis.estimation import prediction_error
+from diagnosis.estimation import windowing
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.simulation.simulator import World
 
@@ -56,7 +56,7 @@ def test_windows_that_blow_up_are_counted_beside_the_curve():
 
     world.simulate = bursts
     mass = {world.candidate("mass", "arm"): (0.5001,)}
-    rows = prediction_error.curve(world, mass, smoother, trajectory, np.array([NOISE]))
+    rows = windowing.curve(world, mass, smoother, trajectory, np.array([NOISE]))
     assert [row["seconds"] > 0.405 for row in rows] == ["blown_up" in row for row in rows]
     assert rows[-1]["blown_up"] == {"before": 0, "after": 2, "of": 4}
     assert all(row["after"] == pytest.approx(row["before"], rel=0.5) for row in rows)
@@ -78,9 +78,9 @@ def test_the_curve_goes_by_time_whatever_the_sampling():
     ]
     smoother = Smoother(world, [fast, *slower])
     noise = np.array([NOISE])
-    entries = prediction_error.curve(world, {}, smoother, smoother.locate({}), noise)
-    windows = prediction_error.consecutive([fast, *slower], 0.9)
-    qpos = prediction_error.predict(world, {}, windows)[0]
+    entries = windowing.curve(world, {}, smoother, smoother.locate({}), noise)
+    windows = windowing.cut([fast, *slower], 0.9)
+    qpos = windowing.predict(world, {}, windows)[0]
     assert entries[-1]["seconds"] == pytest.approx(0.9, abs=0.05)
     for entry in entries:
         square = []
@@ -102,7 +102,7 @@ def test_floor_is_what_noise_does_to_a_perfect_simulator():
         World(mujoco.MjSpec.from_string(xml)),
     )
     smoother = Smoother(world, runs)
-    floor, channels, scatter = prediction_error.floor_error(
+    floor, channels, scatter = windowing.floor_error(
         world, {}, smoother, smoother.locate({}), np.array([NOISE])
     )
     each = [stock_error(xml, run, NOISE) ** 2 for run in runs]
@@ -124,6 +124,6 @@ def test_velocities_that_are_late_differences_raise_the_floor_by_their_error():
         smoother = Smoother(world, [told])
         trajectory = smoother.locate({})
         noise = np.array([NOISE])
-        floors.append(prediction_error.floor_error(world, {}, smoother, trajectory, noise)[0])
+        floors.append(windowing.floor_error(world, {}, smoother, trajectory, noise)[0])
         error, _ = reported_error(world, {}, [told], noise)
     assert floors[1] == pytest.approx(error, rel=0.2) and floors[0] < 0.8 * error

@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnosis.estimation import stock, windowing
+from diagnosis import handover
+from diagnosis.estimation import windowing
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import World
 
@@ -35,8 +36,8 @@ def test_files_predict_what_was_fitted(setting):
         for k in range(2)
     ]
     windows = [w for r in runs for w in windowing.consecutive(r)]
-    model = stock.compiled(world.corrected_xml(setting)[0])
-    found = stock.predicted(model, world.model, windows)
+    model = handover.compiled(world.corrected_xml(setting)[0])
+    found = handover.in_stock_mujoco(model, world.model, windows)
     starts = windowing.recorded_starts(world.model, windows)
     expected = world.simulate([setting] * len(windows), *starts, windows)[0]
     assert found.shape == expected.shape

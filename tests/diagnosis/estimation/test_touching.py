@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from diagnosis.estimation.smoother import Smoother
-from diagnosis.estimation.touching import touching
+from diagnosis.estimation.smoother import Smoother, touching
 from diagnosis.recordings.recording import Recording
 from diagnosis.simulation.simulator import World
 

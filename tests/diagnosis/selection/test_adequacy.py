@@ -7,8 +7,7 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.smoother import Smoother
-from diagnosis.selection.adequacy import lacking, share_left
-from diagnosis.selection.judge import Judge
+from diagnosis.selection.judge import Judge, lacking, share_left
 from diagnosis.selection.plausibility import Usual
 from diagnosis.simulation.simulator import World
 

@@ -155,8 +155,7 @@ def test_what_shows_in_few_groups_is_worth_as_much_and_breaking_others_costs():
     assert -good.loss == pytest.approx(np.log(10), abs=0.2)
     assert paired(free(evidence, ()), good).p_value < 1e-3
     both = evidence_of(ahead, noise + 10 * mends[..., 0], shakes)
-    square = both.squares((0,), np.array([10.0]))
-    assert both._scored(square, ()).loss > 1.0
+    assert both.at((0,), np.array([10.0])).loss > 1.0
 
 
 def test_effects_that_do_the_same_tie():

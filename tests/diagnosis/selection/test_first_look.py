@@ -10,11 +10,11 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 from diagnosis.estimation.ahead import cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
-from diagnosis.selection import first_look
-from diagnosis.selection.first_look import likely
+from diagnosis.selection import beam
+from diagnosis.selection.beam import likely
+from diagnosis.selection.columns import Start, Starts
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual, plausible
-from diagnosis.selection.starts import Start, Starts
 from diagnosis.simulation.simulator import World
 
 
@@ -50,26 +50,26 @@ def kept_of(scene, some, setting={}):
 
 
 def test_what_is_missing_is_kept_first(scene, monkeypatch):
-    monkeypatch.setattr(first_look, "EACH", 1)
-    monkeypatch.setattr(first_look, "MORE", 0)
+    monkeypatch.setattr(beam, "EACH", 1)
+    monkeypatch.setattr(beam, "MORE", 0)
     some = starts(scene, "coulomb_friction", "armature", "mass")
     assert kept_of(scene, some) == {"coulomb_friction"}
     # another look keeps others
-    monkeypatch.setattr(first_look, "EACH", 2)
-    monkeypatch.setattr(first_look, "MORE", 1)
+    monkeypatch.setattr(beam, "EACH", 2)
+    monkeypatch.setattr(beam, "MORE", 1)
     alike = "coulomb_friction", "viscous_damping", "quadratic_damping", "armature"
     assert kept_of(scene, starts(scene, *alike)) == set(alike)
     # what the model has already stays
-    monkeypatch.setattr(first_look, "EACH", 1)
-    monkeypatch.setattr(first_look, "MORE", 0)
+    monkeypatch.setattr(beam, "EACH", 1)
+    monkeypatch.setattr(beam, "MORE", 0)
     friction = {scene[0].candidate("coulomb_friction", "pivot"): (0.1,)}
     assert len(kept_of(scene, some, friction)) == 2
 
 
 def test_waves_that_the_located_force_chose_are_kept(scene, monkeypatch):
     """Row by row a fast ripple explains next to nothing of a noisy motion."""
-    monkeypatch.setattr(first_look, "EACH", 1)
-    monkeypatch.setattr(first_look, "MORE", 0)
+    monkeypatch.setattr(beam, "EACH", 1)
+    monkeypatch.setattr(beam, "MORE", 0)
     ripple, friction = starts(scene, "cogging")[:1], starts(scene, "coulomb_friction")
     waves = [replace(start, merges=True) for start in ripple]
     assert kept_of(scene, [*ripple, *friction]) == {"coulomb_friction"}
@@ -78,7 +78,7 @@ def test_waves_that_the_located_force_chose_are_kept(scene, monkeypatch):
 
 def test_what_shows_only_beside_the_best_is_kept(monkeypatch):
     other = located(damping=0.09, kept=0.0)  # as a fit without dry friction has it
-    monkeypatch.setattr(first_look, "EACH", 1)
+    monkeypatch.setattr(beam, "EACH", 1)
     some = starts(other, "coulomb_friction", "viscous_damping", "mass", "gain", "armature")
     assert {"coulomb_friction", "viscous_damping"} <= kept_of(other, some)
 
@@ -86,8 +86,8 @@ def test_what_shows_only_beside_the_best_is_kept(monkeypatch):
 def test_what_no_row_tells_is_asked_in_windows(scene, monkeypatch):
     """A sensor's scale, and everything where the motion mostly touches something."""
     world, chain, _ = scene
-    monkeypatch.setattr(first_look, "EACH", 1)
-    monkeypatch.setattr(first_look, "MORE", 0)
+    monkeypatch.setattr(beam, "EACH", 1)
+    monkeypatch.setattr(beam, "MORE", 0)
     each = starts(scene, "sensor_scale", "sensor_bias", "coulomb_friction", "mass", "armature")
     rows = {"coulomb_friction"}
     kept = kept_of(scene, each)
@@ -103,7 +103,7 @@ def test_what_changes_nothing_in_the_rows_is_asked_in_windows(scene, monkeypatch
     some = starts(scene, "coulomb_friction", "mass")
     monkeypatch.setattr(chain, "missing", lambda setting, rows: np.ones((len(rows), 2)))
     asked = lambda short, setting, kept, asked, rounds: asked
-    monkeypatch.setattr(first_look, "_by_windows", asked)
+    monkeypatch.setattr(beam, "_by_windows", asked)
     assert likely(MissingForce(chain, {}), some) == some
 
 
@@ -112,7 +112,7 @@ def test_of_a_candidate_the_best_share_and_the_best_whole_value_are_kept(scene):
     size = lambda x: replace(friction, directions=np.array([[x]]), low=np.array([0.3]))
     tried = [friction, replace(friction, directions=np.array([[-0.9]])), size(0.1), size(3.0)]
     missing = MissingForce(scene[1], {})
-    kept = first_look._by_rows(missing.force, {s: missing.basis(s) for s in tried}, 1)
+    kept = beam._by_rows(missing.force, {s: missing.basis(s) for s in tried}, 1)
     assert len(kept) == 2 and kept.count(tried[2]) == 1
     assert [start.whole for start in sorted(kept, key=lambda s: s.whole)] == [False, True]
 
@@ -132,13 +132,13 @@ def test_whole_values_are_looked_at_within_their_bounds(monkeypatch):
     bounds = np.array([0.3]), np.array([3.0])
     whole = lambda x: Start(candidate, np.zeros(1), np.array([[x]]), *bounds, prior)
     near, tiny = whole(0.8 * seconds), whole(seconds / 30)
-    monkeypatch.setattr(first_look, "MORE", 0)
+    monkeypatch.setattr(beam, "MORE", 0)
     assert likely(MissingForce(chain, {}), [tiny, near]) == [near]
 
 
 def test_a_look_at_all_starts_keeps_those_of_the_setting(scene, monkeypatch):
     world, chain, usual = scene
-    monkeypatch.setattr(first_look, "EACH", 1)
+    monkeypatch.setattr(beam, "EACH", 1)
     armature = world.candidate("armature", "pivot")
     friction = world.candidate("coulomb_friction", "pivot")
     setting = {armature: armature.nominal}

@@ -11,7 +11,7 @@ from diagnosis.selection import identification
 from diagnosis.selection.criterion import PRICE, Comparison, Score
 from diagnosis.selection.identification import Identification
 from diagnosis.selection.judge import changing
-from diagnosis.selection.unmodelled_force import Dependence
+from diagnosis.selection.missing_force import Dependence
 from diagnosis.simulation.simulator import World
 
 
@@ -32,7 +32,7 @@ def curves_of(search, monkeypatch, setting):
         ("shoulder", ("position:shoulder",)),
     ]
     located = [Dependence(joint, told, 0.9, (joint, told), ()) for joint, told in four]
-    monkeypatch.setattr(identification, "dependences", lambda *args, most: located)
+    monkeypatch.setattr(identification, "dependences", lambda *args: located)
     return [candidate for candidate, _ in search._curves(setting)]
 
 
@@ -273,6 +273,7 @@ def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
     best, asked = fitted(search, ["armature"], -1.0), []
     monkeypatch.setattr(search, "begin", lambda *given: None)
     monkeypatch.setattr(search, "judge", lambda: None)
+    monkeypatch.setattr(search, "locate", lambda setting: ("located", "first"))
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
 
     def round_of(setting, judge):
@@ -280,7 +281,7 @@ def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
         return best, len(asked) < 2
 
     monkeypatch.setattr(search, "_round", round_of)
-    found = search._rounds({}, "located", "first")
+    found = search.run()
     assert asked == [{}, best.setting] and found.fitted is best
     assert (found.trajectory, found.first) == ("moved", "first")
 

@@ -13,11 +13,10 @@ from diagnosis.estimation.ahead import GROUPS, Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.beam import Beam
-from diagnosis.selection.columns import Columns
+from diagnosis.selection.columns import Columns, Starts
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
-from diagnosis.selection.starts import Starts
 from diagnosis.simulation.simulator import World
 
 FRICTION = 0.1

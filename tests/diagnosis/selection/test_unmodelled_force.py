@@ -8,7 +8,7 @@ import pytest
 
 from diagnosis.estimation.smoother import Trajectory
 from diagnosis.recordings.recording import Recording
-from diagnosis.selection.unmodelled_force import CLIP, LEAST, _explained, dependences, places_of
+from diagnosis.selection.missing_force import CLIP, LEAST, _explained, dependences, places_of
 from diagnosis.simulation.simulator import World
 
 ARM = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
@@ -120,7 +120,7 @@ def test_a_drive_that_is_asked_for_nothing_multiplies_no_curve():
     world, trajectory, [run] = made_up(lambda q, v, u, t: at(0, 0.3 * np.sin(4 * q[:, 0])))
     idle = replace(run, ctrl=np.zeros_like(run.ctrl))
     trajectory = replace(trajectory, first={idle: 0})
-    found = dependences(world, trajectory, [idle], most=None)
+    found = dependences(world, trajectory, [idle])
     assert found and not any("control:m" in d.variables for d in found)
 
 
@@ -160,7 +160,7 @@ def test_chosen_knots_predict_no_force_that_wanders_by_itself():
     block = np.arange(2000) * 16 // 2000
     for _ in range(30):
         x, force = (np.convolve(rng.normal(size=2024), smooth, "valid") for _ in range(2))
-        seen.append(_explained(force, force, x, np.ones(2000), block, "position:j").share > LEAST)
+        seen.append(_explained(force, force, x, np.ones(2000), block, "position:j")[0] > LEAST)
     assert np.mean(seen) < 0.15
 
 
