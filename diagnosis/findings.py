@@ -59,6 +59,8 @@ def assemble(world, train, held_out, outcome):
         left = 0.0  # noise that is not white does as much
     findings = _findings(world, outcome, bounds, figure)
     findings = led(world, outcome, findings, left > 0, figure["channels"])
+    for finding in findings:
+        finding["when"] = stamped(finding["when"], train)
     hint = outcome.left[0] if outcome.left and left > 0 else None
     summary = {
         "format": 2,
@@ -98,6 +100,13 @@ def _findings(world, outcome, bounds, figure):
     given = world, settings, outcome.found.smoother.recordings, outcome.trajectory, outcome.event
     found += [(None, fault) for fault in sensor_faults.faults(*given)]
     return sorted(found, key=lambda pair: -pair[1]["evidence"]["held_out_error_removed"])
+
+
+def stamped(when, recordings):
+    """A condition by its recording's own time stamps; one of every recording as it is, in s since
+    each began."""
+    origin = {r.name: r.origin for r in recordings}.get((when or {}).get("recording"))
+    return {**when, "time": [t + origin for t in when["time"]]} if origin else when
 
 
 def verdict(findings, something):

@@ -36,7 +36,7 @@ class Recording:
     """One continuous run, equal to itself alone. NaN: not measured. Columns stand in MuJoCo's
     order.
 
-    name: file name; time (T,) s, increasing; qpos (T, nq) m or rad; qvel (T, nv), all NaN when
+    name: file name; time (T,) s, increasing; origin: the stamp that it counts from, s; qpos (T, nq) m or rad; qvel (T, nv), all NaN when
     absent; ctrl (T, nu), without NaN; sensors: name -> (T, k). start: the row from which on it is
     predicted where it is held out; those before only say what led there, such as controls that are
     still on their way. gains: {joint: {"kp", "kd"}} of the controllers whose targets the controls
@@ -54,6 +54,7 @@ class Recording:
     gains: dict = field(default_factory=dict)
     notes: tuple = ()
     quality: object = None
+    origin: float = 0.0
 
     def seen(self):
         """The rows from `start` on, as a Recording of their own."""
@@ -156,7 +157,8 @@ def _recording(path, name, columns, model, first_row):
         )
     _quaternions(path, arrays["qpos"], model, first_row)
     name = name.encode("utf-8", "replace").decode()  # it can hold any byte
-    return Recording(name, time, sensors=sensors, **arrays)
+    # curves over time and a fading gain count from where a recording begins
+    return Recording(name, time - time[0], sensors=sensors, origin=float(time[0]), **arrays)
 
 
 def _possible(path, column, values, first_row):

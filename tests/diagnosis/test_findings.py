@@ -1,5 +1,7 @@
 """Findings: knots of curves and numbers where the contract has numbers, shares of errors."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 from arm import ARM, arm
@@ -62,6 +64,13 @@ def test_a_finding_whose_intervals_hold_every_nominal_value_is_not_certain():
     poles, phase = (30.0, 31.0), (0.4, 0.5)
     assert findings.certain(ripple, [(0.1, 0.2), poles, phase])
     assert not findings.certain(ripple, [(-0.1, 0.2), poles, phase])  # of no amplitude
+
+
+def test_a_condition_is_told_by_the_stamps_of_its_recording():
+    runs = [SimpleNamespace(name="one", origin=100.0), SimpleNamespace(name="two", origin=0.0)]
+    there = lambda name: findings.stamped({"recording": name, "time": [1.0, 2.5]}, runs)["time"]
+    assert (there("one"), there("two"), there(None)) == ([101.0, 102.5], [1.0, 2.5], [1.0, 2.5])
+    assert findings.stamped(None, runs) is None
 
 
 def test_a_mismatch_is_led_by_a_name_and_has_one_that_is_adequate():

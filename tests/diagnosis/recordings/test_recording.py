@@ -57,6 +57,15 @@ def test_csv_and_npz_hold_the_same(tmp_path, model, good):
     np.testing.assert_array_equal(b.qpos, good[:, 1:3])
 
 
+def test_time_counts_from_the_first_row_and_its_stamp_is_kept(tmp_path, model, good):
+    """Clocks of loggers count from 1970."""
+    late = good.copy()
+    late[:, 0] += 1.75e9
+    (there,) = load(put(tmp_path, archive(**whole(late)), "run.npz"), model)
+    np.testing.assert_allclose(there.time, good[:, 0] - good[0, 0], atol=1e-6)
+    assert there.origin == late[0, 0] and there.part(5, None).origin == there.origin
+
+
 def test_columns_in_any_order_by_name_or_index(tmp_path, model, good):
     order = [5, 2, 0, 6, 1]
     names = {"qpos:elbow": "qpos:1", "ctrl:shoulder_motor": "ctrl:0"}
