@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diagnosis import findings
+from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation.intervals import intervals
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
@@ -136,6 +137,7 @@ def _earned(search, judge, fitted):
 def _checked(search, found, fitted, others, log):
     """The Outcome so far: curves tried beside the names, and what is left."""
     world, train, judge = search.world, search.train, found.judge
+    fitted = _bare(search, found, fitted, log)
     dependences = missing_force.dependences(world, found.first, train)
     trajectory = found.trajectory
     left = missing_force.dependences(world, trajectory, train)
@@ -150,7 +152,9 @@ def _checked(search, found, fitted, others, log):
         # where no name is found, all that is told are a joint and a variable
         units = complexity([rest.candidate]) if mine else UNNAMED
         tries = [_beside(search, judge, finer, rest, PRICE * units)]
-        tries += [_instead(search, found, finer, mine, rest.joint)] if mine else []
+        alone = _instead(search, found, finer, mine, rest.joint) if mine else None
+        if alone and alone.loss < finer.loss:
+            tries += [alone] if search.no_chance(paired(finer.score, alone.score)) else []
         beside = min(filter(None, tries), key=lambda f: f.loss, default=None)
         if not beside:
             continue
@@ -161,17 +165,27 @@ def _checked(search, found, fitted, others, log):
 
 
 def _instead(search, found, fitted, names, joint):
-    """The Fitted set with the curve that the force at a joint follows best in the place of the
-    names there, or None where that is no better."""
+    """The Fitted set with the curve that the force at a joint follows best in the place of what
+    acts there, or None where it follows nothing."""
     rest = {c: v for c, v in fitted.setting.items() if c not in names}
     trajectory = copy(found.smoother).locate(rest, found.trajectory, passes=1)
     follows = missing_force.dependences(search.world, trajectory, search.train)
     curve = next((d for d in follows if d.joint == joint), None)
     if not curve:
         return None
-    alone = found.judge.fit({**rest, curve.candidate: curve.values}, steps=2)
-    better = alone.loss < fitted.loss and search.no_chance(paired(fitted.score, alone.score))
-    return alone if better else None
+    return found.judge.fit({**rest, curve.candidate: curve.values}, steps=2)
+
+
+def _bare(search, found, fitted, log):
+    """The Fitted set with one curve in the place of a curve and names of its joint, where these are
+    not earned over it: beside a curve any name fits that it makes up for."""
+    for joint in [c.place.name for c in fitted.setting if isinstance(c.effect, Unknown)]:
+        mine = [c for c in fitted.setting if _at(search.world, c, joint)]
+        alone = _instead(search, found, fitted, mine, joint) if len(mine) > 1 else None
+        if alone and not search.earned(alone, fitted):
+            log(f"  one curve at {joint}: {alone.loss:.3f} {said(alone.setting)}")
+            fitted = alone
+    return fitted
 
 
 def _sometimes(search, found, fitted, log):

@@ -36,12 +36,13 @@ class Recording:
     """One continuous run, equal to itself alone. NaN: not measured. Columns stand in MuJoCo's
     order.
 
-    name: file name; time (T,) s, increasing; origin: the stamp that it counts from, s; qpos (T, nq) m or rad; qvel (T, nv), all NaN when
-    absent; ctrl (T, nu), without NaN; sensors: name -> (T, k). start: the row from which on it is
-    predicted where it is held out; those before only say what led there, such as controls that are
-    still on their way. gains: {joint: {"kp", "kd"}} of the controllers whose targets the controls
-    are, where the file says so. notes: what its reader found odd, one line each. quality: what was
-    done to it before (quality.Quality), once that was looked at.
+    name: file name; time (T,) s, increasing; origin: the stamp that it counts from, s; qpos (T,
+    nq) m or rad; qvel (T, nv), all NaN when absent; ctrl (T, nu), without NaN; sensors: name ->
+    (T, k). start: the row from which on it is predicted where it is held out; those before only
+    say what led there, such as controls that are still on their way. gains: {joint: {"kp",
+    "kd"}} of the controllers whose targets the controls are, where the file says so. notes:
+    what its reader found odd, one line each. quality: what was done to it before
+    (quality.Quality), once that was looked at.
     """
 
     name: str

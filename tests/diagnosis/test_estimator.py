@@ -217,6 +217,24 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
 
 
 @pytest.mark.parametrize(
+    "joint, earned, bare", [(0, False, True), (0, True, False), (1, False, False)]
+)
+def test_a_name_beside_a_curve_of_its_joint_has_to_be_earned_over_one_curve(
+    monkeypatch, joint, earned, bare
+):
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    curve, name = world.curve("pivot", "time", (0.0, 1.0)), world.candidate("back_emf", "drive")
+    both = SimpleNamespace(setting={curve: (0.1, 0.1), name: (0.1,)})
+    alone = SimpleNamespace(setting={curve: (0.2, 0.1)}, loss=-1.0)
+    monkeypatch.setattr(world, "joints", lambda place: (joint if place.name == "drive" else 0,))
+    asked = lambda search, found, fitted, names, joint: alone if {*names} == {curve, name} else None
+    monkeypatch.setattr(estimator, "_instead", asked)
+    search = SimpleNamespace(world=world, earned=lambda before, after: earned)
+    told = estimator._bare(search, None, both, lambda what: None)
+    assert told is (alone if bare else both)
+
+
+@pytest.mark.parametrize(
     "loss, removed, bounds, told",
     [
         (-1.0, 0.3, (1.0, 3.0), True),
