@@ -28,9 +28,9 @@ PARTS = []
 class Look:
     """What the laws see of one simulation, after the stages of position, velocity and actuation."""
 
-    def __init__(self, model, data):
+    def __init__(self, model, data, ahead=0.0):
         self.model, self.data = model, data
-        self.time, self.step = data.time, model.opt.timestep
+        self.time, self.step = data.time + ahead, model.opt.timestep
 
     def position(self, joint):
         """rad or m."""
@@ -306,20 +306,21 @@ def corrections(model, look):
 MEMORY = {}
 
 
-def step(model, data, nstep=1):
+def step(model, data, nstep=1, ahead=0.0):
     """As mujoco.mj_step, with what PARTS adds, worked out at the beginning of each step.
 
-    data.ctrl and data.qfrc_applied are the caller's, and left as they are.
+    data.ctrl and data.qfrc_applied are the caller's, and left as they are. ahead: s, by which the
+    laws' clock is ahead of data.time.
     """
     memory = MEMORY.setdefault(id(data), {})
     for _ in range(nstep):
         wanted, pushed = data.ctrl.copy(), data.qfrc_applied.copy()
         least = model.dof_frictionloss.copy()
-        data.ctrl[:] = controls(model, Look(model, data), wanted, memory)
+        data.ctrl[:] = controls(model, Look(model, data, ahead), wanted, memory)
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_fwdActuation(model, data)
-        force, level = corrections(model, Look(model, data))
+        force, level = corrections(model, Look(model, data, ahead))
         for dof, value in force:
             data.qfrc_applied[dof] += value
         for dof, value in level:
@@ -369,18 +370,17 @@ def rollout(model, qpos, qvel, ctrl, time):
     """
     data, states = mujoco.MjData(model), []
     for q, v, u in zip(qpos, qvel, ctrl):
-        begin(model, data, u[0], time[0])
+        begin(model, data, u[0])
         data.qpos[:], data.qvel[:] = q, v
         states.append(list(run(model, data, u, time)))
     q, v = (np.array([[state[k] for state in one] for one in states]) for k in (0, 1))
     return q, v
 
 
-def begin(model, data, ctrl, time):
+def begin(model, data, ctrl):
     """At rest in a control: reset, with the delays' and lags' past filled."""
     mujoco.mj_resetData(model, data)
     MEMORY.pop(id(data), None)
-    data.time = time
     ctrl = controls(model, Look(model, data), ctrl, {})
     for a in np.flatnonzero(model.actuator_ctrlnum == 1):
         u = model.actuator_ctrladr[a]
@@ -388,22 +388,26 @@ def begin(model, data, ctrl, time):
         value = np.clip(ctrl[u], *model.actuator_ctrlrange[u]) if limited else ctrl[u]
         if model.actuator_delay[a] > 0:
             count = model.actuator_history[a, 0]
-            past = time - model.opt.timestep * np.arange(count, 0, -1)
+            past = -model.opt.timestep * np.arange(count, 0, -1)
             mujoco.mj_initCtrlHistory(model, data, a, past, np.full(count, value))
         if model.actuator_actadr[a] >= 0 and model.actuator_dyntype[a] in FILTERS:
             data.act[model.actuator_actadr[a]] = value
 
 
 def run(model, data, ctrl, time):
-    """Yields (qpos, qvel) at each time of time (T,), stepping on from data under ctrl (T, nu)."""
+    """Yields (qpos, qvel) at each time of time (T,), stepping on from data under ctrl (T, nu).
+
+    data.time goes its own way: seconds since 1970 would round each of its steps, and delays ask
+    for equal ones.
+    """
     yield data.qpos.copy(), data.qvel.copy()
     h = model.opt.timestep
-    for u, seconds in zip(ctrl, np.diff(time)):
+    for u, now, seconds in zip(ctrl, time, np.diff(time)):
         steps = max(1, int(np.ceil(seconds / h - 1e-3)))
         exact = abs(steps * h - seconds) < 2e-3 * h
         model.opt.timestep = h if exact else seconds / steps
         data.ctrl[: len(u)] = u
-        step(model, data, steps)
+        step(model, data, steps, now - data.time)
         model.opt.timestep = h
         yield data.qpos.copy(), data.qvel.copy()
 
@@ -421,7 +425,7 @@ def predict(model, time, qpos, qvel, ctrl, windows, run_up=0.5):
         first, last = windows[k]
         if row > first or time[first] - time[row] > run_up:
             row = earlier(time, qpos, qvel, first, run_up)
-            begin(model, data, ctrl[row], time[row])
+            begin(model, data, ctrl[row])
             data.qpos[q], data.qvel[v] = qpos[row], qvel[row]
         for _ in run(model, data, ctrl[row:first], time[row : first + 1]):
             pass

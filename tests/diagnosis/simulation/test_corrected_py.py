@@ -20,6 +20,7 @@ from plants import (
     T,
     arm,
     commanded,
+    driven_by,
     pendulum,
     record,
     simulate,
@@ -173,6 +174,18 @@ def test_a_drive_that_fades_stays_within_the_joints_range(tmp_path, effect):
     assert abs(nominal - expected).max() > 1e-3
     np.testing.assert_allclose(qpos, expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(script, expected, rtol=0, atol=1e-9)
+
+
+def test_stamps_since_1970_keep_the_clock_and_the_delays(tmp_path):
+    """Of a tone of 5 Hz and of controls late by exactly a row, with rows of 10 ms to a µs."""
+    world, _ = driven_by('<motor name="m" joint="j" delay="0.01" nsample="12"/>')
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(1000)
+    plain = commanded(time, 0.2 * rng.choice([-1.0, 1.0], (1000, 1)))
+    stamped = replace(plain, time=1.7e9 + time + rng.uniform(-5e-7, 5e-7, 1000))
+    setting = {world.curve("j", "time", (0.0, 0.05), wave=True): (1.0, 0.0)}
+    parts, _ = script_of(tmp_path, world, setting)
+    expected, found = (in_script(tmp_path, parts, r, 1000) for r in (plain, stamped))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-4)
 
 
 @pytest.mark.parametrize("kind", ["motors", "servos"])
