@@ -15,6 +15,7 @@ import numpy as np
 
 from diagnosis.estimation import windowing
 from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predictions, python_parts
+from diagnosis.simulation.corrected_template import divided
 from diagnosis.simulation.editable_model import FILTERS
 
 SCATTER = 2.0  # standard deviations that are taken for chance
@@ -206,8 +207,7 @@ def in_stock_mujoco(model, nominal, windows):
             if row < last:
                 data.ctrl[drives] = np.nan_to_num(recording.ctrl[row, inputs])
                 gap = recording.time[row + 1] - recording.time[row]
-                count = max(1, round(gap / length))
-                model.opt.timestep = gap / count
+                count, model.opt.timestep = divided(gap, length)  # as corrected.py
                 mujoco.mj_step(model, data, nstep=count)
     model.opt.timestep = length
     return out

@@ -403,13 +403,18 @@ def run(model, data, ctrl, time):
     yield data.qpos.copy(), data.qvel.copy()
     h = model.opt.timestep
     for u, now, seconds in zip(ctrl, time, np.diff(time)):
-        steps = max(1, int(np.ceil(seconds / h - 1e-3)))
-        exact = abs(steps * h - seconds) < 2e-3 * h
-        model.opt.timestep = h if exact else seconds / steps
+        steps, model.opt.timestep = divided(seconds, h)
         data.ctrl[: len(u)] = u
         step(model, data, steps, now - data.time)
         model.opt.timestep = h
         yield data.qpos.copy(), data.qvel.copy()
+
+
+def divided(seconds, h):
+    """(number, length in s) of the equal time steps in some seconds: of h where these fit, else
+    shorter."""
+    steps = max(1, int(np.ceil(seconds / h - 1e-3)))
+    return steps, h if abs(steps * h - seconds) < 2e-3 * h else seconds / steps
 
 
 def predict(model, time, qpos, qvel, ctrl, windows, run_up=0.5):

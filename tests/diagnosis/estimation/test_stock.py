@@ -7,6 +7,7 @@ import pytest
 from diagnosis import handover
 from diagnosis.estimation import windowing
 from diagnosis.recordings.recording import Recording
+from diagnosis.simulation.corrected_py import module_of
 from diagnosis.simulation.simulator import World
 
 ARM = """<mujoco><option timestep="0.002"/><default><geom contype="0" conaffinity="0"/></default>
@@ -42,3 +43,22 @@ def test_files_predict_what_was_fitted(setting):
     expected = world.simulate([setting] * len(windows), *starts, windows)[0]
     assert found.shape == expected.shape
     np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "step, row", [(0.008, 0.01), (0.01, 0.0149), (0.002, 0.003), (0.005, 0.01)]
+)
+def test_a_script_that_adds_nothing_predicts_the_same(step, row):
+    """Whatever part of a row a time step is."""
+    world = World(mujoco.MjSpec.from_string(ARM.replace("0.002", str(step))))
+    time = row * np.arange(101)
+    qpos = np.stack([np.sin(3 * time), np.cos(4 * time)], 1)
+    ctrl = np.random.default_rng(0).uniform(-1, 1, (101, 1))
+    recording = Recording("r.csv", time, qpos, np.full((101, 2), np.nan), ctrl)
+    windows = windowing.consecutive(recording)
+    found = stock.predicted(world.model, world.model, windows)
+    rows = [(w.first, w.last) for w in windows]
+    states = windowing.states(world.model, recording)
+    expected = module_of([], ["j", "k"]).predict(world.model, time, *states, ctrl, rows)
+    for one, other in zip(found, expected):
+        np.testing.assert_allclose(one[: len(other)], other, rtol=0, atol=1e-9)
