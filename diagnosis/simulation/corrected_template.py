@@ -422,31 +422,27 @@ def predict(model, time, qpos, qvel, ctrl, windows, run_up=0.5):
 
     time (T,), qpos (T, n), qvel (T, m), ctrl (T, nu) as recorded, columns of JOINTS and actuators
     in order. A window starts from its first row as recorded; what is not recorded (delays, lags,
-    bristles, added joints) runs on from the window before, or from `run_up` seconds earlier.
+    integrals, bristles, added joints) runs on from the window before, or from the first row of all,
+    the recorded joints brought back to the record every `run_up` seconds.
     """
     q, v = columns(model)
+    whole = np.isfinite(qpos).all(axis=1) & np.isfinite(qvel).all(axis=1)
     data, out, row = mujoco.MjData(model), [None] * len(windows), len(time)
     for k in np.argsort([first for first, _ in windows], kind="stable"):
         first, last = windows[k]
-        if row > first or time[first] - time[row] > run_up:
-            row = earlier(time, qpos, qvel, first, run_up)
+        if row > first:
+            row = 0
             begin(model, data, ctrl[row])
-            data.qpos[q], data.qvel[v] = qpos[row], qvel[row]
-        for _ in run(model, data, ctrl[row:first], time[row : first + 1]):
-            pass
+        back = -np.inf
+        for i in range(row, first):
+            if whole[i] and time[i] - back >= run_up:
+                data.qpos[q], data.qvel[v], back = qpos[i], qvel[i], time[i]
+            for _ in run(model, data, ctrl[i : i + 1], time[i : i + 2]):
+                pass
         data.qpos[q], data.qvel[v] = qpos[first], qvel[first]
         states = run(model, data, ctrl[first:last], time[first : last + 1])
         out[k], row = np.array([state[0][q] for state in states]), last
     return out
-
-
-def earlier(time, qpos, qvel, first, run_up):
-    """The row, fully recorded, from which to run up to row `first`."""
-    whole = any(law == "effort_fade" for law, _, _ in PARTS)
-    row = 0 if whole else int(np.searchsorted(time, time[first] - run_up - 1e-9))
-    while row < first and not np.isfinite([*qpos[row], *qvel[row]]).all():
-        row += 1
-    return row
 
 
 def columns(model):

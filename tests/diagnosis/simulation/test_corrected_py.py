@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from mujoco.batch import Batch
 from plants import (
     DT,
+    INTEGRATOR,
     SIZES,
     START,
     WEAKER,
@@ -75,7 +76,8 @@ def script_of(folder, world, setting):
     xml, written = world.corrected_xml(setting)
     parts = python_parts(world.model, setting, written)
     (folder / "corrected.xml").write_text(xml)
-    (folder / "corrected.py").write_text(corrected_py(parts, JOINTS), encoding="utf-8")
+    joints = [world.model.joint(j).name for j in range(world.model.njnt)]
+    (folder / "corrected.py").write_text(corrected_py(parts, joints), encoding="utf-8")
     return parts, written
 
 
@@ -255,6 +257,29 @@ def test_predictions_of_windows_in_a_process_of_its_own(tmp_path):
     unmeasured = replace(run, qvel=np.full_like(v, np.nan))
     (rough,) = predictions(tmp_path / "corrected.py", [Window(unmeasured, 20, 25)], world.model)
     assert 0 < abs(rough - q[20:26]).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    "actuator, effect, values",
+    [
+        (INTEGRATOR, ("friction_map", "j"), (0.01, 0.8, 5.0, 0.4)),
+        ('<motor name="m" joint="j"/>', ("rate_limit", "m"), (0.2,)),
+    ],
+)
+def test_what_drives_remember_a_tail_knows(tmp_path, actuator, effect, values):
+    """An integral, and a control that follows for longer than joints are left to themselves."""
+    world, _ = driven_by(actuator)
+    time = 0.01 * np.arange(150)
+    recording = commanded(time, np.where(time < 0.2, 1.0, np.where(time < 1.2, -0.3, 0.1))[:, None])
+    setting = {world.candidate(*effect): values}
+    script_of(tmp_path, world, setting)
+    whole = Window(recording, 0, 149)
+    q, v = (x[0] for x in world.simulate([setting], [[0.0]], [[0.0]], [whole]))
+    qpos = q.copy()
+    qpos[:100:2] = np.nan
+    tail = Window(replace(recording, qpos=qpos, qvel=v), 105, 149)
+    (found,) = predictions(tmp_path / "corrected.py", [tail], world.model)
+    np.testing.assert_allclose(found, q[105:], rtol=0, atol=1e-9)
 
 
 def test_the_script_stands_alone(tmp_path):
