@@ -64,8 +64,8 @@ class Look:
         value = data.ctrl[u]
         if model.actuator_delay[a] > 0:
             seen = np.zeros((1, 1))
-            when = data.time - model.actuator_delay[a]
-            found = mujoco.mj_readCtrl(model, data, a, when, seen, INTERPOLATED)
+            interp = int(model.actuator_history[a, 1])
+            found = mujoco.mj_readCtrl(model, data, a, data.time, seen, interp)
             value = np.ravel(seen if found is None else found)[0]
         return (
             np.clip(value, *model.actuator_ctrlrange[u]) if model.actuator_ctrllimited[u] else value
@@ -73,7 +73,6 @@ class Look:
 
 
 FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
-INTERPOLATED = 1
 
 
 def joint_id(model, name):

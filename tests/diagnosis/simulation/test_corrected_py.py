@@ -178,6 +178,21 @@ def test_a_drive_that_fades_stays_within_the_joints_range(tmp_path, effect):
     np.testing.assert_allclose(script, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("more", [{}, {("delay", "m"): (0.0131,)}])
+@pytest.mark.parametrize("factor", [None, "control:m"])
+def test_a_force_over_a_late_control_is_late_once(tmp_path, more, factor):
+    """By the nominal model's delay, of whole steps, or by one that is written, of parts of one."""
+    world, _ = driven_by('<motor name="m" joint="j" delay="0.0095" nsample="12"/>')
+    curve = world.curve("j", "position:j" if factor else "control:m", (-1.0, 0.0, 1.0), factor)
+    setting = {curve: (0.3, 0.1, -0.2)} | {world.candidate(*c): v for c, v in more.items()}
+    ctrl = np.random.default_rng(0).uniform(-1, 1, (ROWS, 1))
+    window = Window(commanded(DT * np.arange(ROWS), ctrl), 0, ROWS - 1)
+    (expected,) = world.simulate([setting], [START[0][:1]], [START[1][:1]], [window])[0]
+    parts, _ = script_of(tmp_path, world, setting)
+    script = in_script(tmp_path, parts, window.recording)
+    np.testing.assert_allclose(script, expected, rtol=0, atol=1e-9)
+
+
 def test_stamps_since_1970_keep_the_clock_and_the_delays(tmp_path):
     """Of a tone of 5 Hz and of controls late by exactly a row, with rows of 10 ms to a µs."""
     world, _ = driven_by('<motor name="m" joint="j" delay="0.01" nsample="12"/>')
