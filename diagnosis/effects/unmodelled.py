@@ -107,10 +107,10 @@ class Unknown(JointEffect):
 
     def part(self, model, i, values):
         numbers = {
-            "of": self.variable,
+            "of": _in_script(model, self.variable),
             "knots": list(self.knots),
             "forces": [float(v) for v in values],
-            "factor": self.factor,
+            "factor": self.factor and _in_script(model, self.factor),
         }
         return Part("wave" if self.wave else "curve", model.joint(i).name, numbers)
 
@@ -164,6 +164,14 @@ class Unknown(JointEffect):
             if holds(lambda x: basis(x) @ fit, x, y, zero):
                 return np.pad(fit, (0, 3 - order))
         return None
+
+
+def _in_script(model, variable):
+    """A variable as corrected.py has it. A control is what reaches the actuator: where the model
+    has a filter or an integral of its own, what goes into that."""
+    kind, _, name = variable.partition(":")
+    inside = kind == "control" and model.actuator(name).dyntype[0] != mujoco.mjtDyn.mjDYN_NONE
+    return f"command:{name}" if inside else variable
 
 
 def reader(models):

@@ -249,12 +249,17 @@ class BatchLook:
         return self._state["actuator_force"][:, self.model.actuator(actuator).id]
 
     def control(self, actuator):
+        if self.model.actuator(actuator).actadr[0] >= 0:
+            raise ValueError(f"actuator {actuator}: a batch does not tell its filtered control")
+        return self.command(actuator)
+
+    def command(self, actuator):
         a = self.model.actuator(actuator).id
         u, value = (
             self.model.actuator_ctrladr[a],
             self._state["ctrl"][:, self.model.actuator_ctrladr[a]],
         )
-        if self.model.actuator_delay[a] > 0 or self.model.actuator_actadr[a] >= 0:
+        if self.model.actuator_delay[a] > 0:
             raise ValueError(f"actuator {actuator}: a batch does not tell its delayed control")
         limited = self.model.actuator_ctrllimited[u]
         return np.clip(value, *self.model.actuator_ctrlrange[u]) if limited else value
@@ -266,7 +271,7 @@ class CorrectedBatch(Batch):
     batch = CorrectedBatch(model, nsim=64, parts=parts_in(text))      # and then as any Batch
 
     Joints whose friction varies get a dof_frictionloss of each simulation's own. step() raises
-    ValueError for a force over the control of an actuator with a delay or a filter.
+    ValueError for a force over the control of an actuator with a delay or the filter of a lag.
     """
 
     def __init__(self, model, nsim, nthread=0, parts=()):

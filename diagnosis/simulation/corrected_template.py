@@ -52,14 +52,19 @@ class Look:
     def control(self, actuator):
         """As it acts now: within its range, delayed, filtered."""
         model, data, a = self.model, self.data, actuator_id(self.model, actuator)
-        if model.actuator_actadr[a] >= 0 and model.actuator_dyntype[a] in FILTERS:
-            i = model.actuator_actadr[a]
-            lag, passed = model.actuator_dynprm[a, 0], self.step
-            if not model.actuator_actearly[a]:
-                return data.act[i]
-            if model.actuator_dyntype[a] == int(mujoco.mjtDyn.mjDYN_FILTEREXACT):
-                passed = lag * -np.expm1(-self.step / lag)
-            return data.act[i] + passed * data.act_dot[i]
+        if model.actuator_actadr[a] < 0 or model.actuator_dyntype[a] not in FILTERS:
+            return self.command(actuator)
+        i = model.actuator_actadr[a]
+        lag, passed = model.actuator_dynprm[a, 0], self.step
+        if not model.actuator_actearly[a]:
+            return data.act[i]
+        if model.actuator_dyntype[a] == int(mujoco.mjtDyn.mjDYN_FILTEREXACT):
+            passed = lag * -np.expm1(-self.step / lag)
+        return data.act[i] + passed * data.act_dot[i]
+
+    def command(self, actuator):
+        """The control as it reaches the actuator: within its range, delayed, not filtered."""
+        model, data, a = self.model, self.data, actuator_id(self.model, actuator)
         u = model.actuator_ctrladr[a]
         value = data.ctrl[u]
         if model.actuator_delay[a] > 0:
@@ -130,22 +135,22 @@ def friction_curve(look, joint, knots, levels):
 
 
 def variable(look, name):
-    """The value of 'position:<joint>', 'velocity:…', 'load:…', 'control:<actuator>' or 'time'."""
+    """The value of 'position:<joint>', 'velocity:…', 'load:…', 'control:<actuator>', 'command:…' or
+    'time'."""
     kind, _, place = name.partition(":")
     if kind == "time":
         return look.time
     if kind == "load":
         return drive(look, place)
-    return {"position": look.position, "velocity": look.velocity, "control": look.control}[kind](
-        place
-    )
+    return getattr(look, kind)(place)
 
 
-def asked(look, actuator):
-    """Control of an actuator; of a servo, less where it already is: its force over its gain."""
+def asked(look, kind, actuator):
+    """Control of an actuator, or its command; of a servo, less where it already is: its force over
+    its gain."""
     model, a = look.model, actuator_id(look.model, actuator)
     gain, bias = model.actuator_gainprm[a, 0], model.actuator_biasprm[a]
-    u = look.control(actuator)
+    u = variable(look, f"{kind}:{actuator}")
     if model.actuator_biastype[a] != int(mujoco.mjtBias.mjBIAS_AFFINE) or not gain:
         return u
     joint, gear = model.joint(model.actuator_trnid[a, 0]).name, model.actuator_gear[a, 0]
@@ -159,8 +164,8 @@ def factor_of(look, factor):
     if factor is None:
         return 1.0
     kind, _, place = factor.partition(":")
-    if kind == "control":
-        return asked(look, place)
+    if kind in ("control", "command"):
+        return asked(look, kind, place)
     velocity = look.velocity(place)
     return {"velocity": np.sign(velocity), "speed": abs(velocity), "damping": velocity}[kind]
 

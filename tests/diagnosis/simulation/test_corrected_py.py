@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from mujoco.batch import Batch
 from plants import (
     DT,
+    FILTER,
     INTEGRATOR,
     SIZES,
     START,
@@ -43,6 +44,7 @@ from diagnosis.simulation.simulator import Window
 
 AXES = "position:elbow", "velocity:swing"
 ROWS = 45  # of the recording, in the script
+CURVE = (0.3, 0.1, -0.2)  # forces at three knots
 JOINTS = ["lift", "swing", "elbow"]
 OF_DRIVES = {
     "load_friction",
@@ -184,13 +186,35 @@ def test_a_force_over_a_late_control_is_late_once(tmp_path, more, factor):
     """By the nominal model's delay, of whole steps, or by one that is written, of parts of one."""
     world, _ = driven_by('<motor name="m" joint="j" delay="0.0095" nsample="12"/>')
     curve = world.curve("j", "position:j" if factor else "control:m", (-1.0, 0.0, 1.0), factor)
-    setting = {curve: (0.3, 0.1, -0.2)} | {world.candidate(*c): v for c, v in more.items()}
+    setting = {curve: CURVE} | {world.candidate(*c): v for c, v in more.items()}
     ctrl = np.random.default_rng(0).uniform(-1, 1, (ROWS, 1))
     window = Window(commanded(DT * np.arange(ROWS), ctrl), 0, ROWS - 1)
     (expected,) = world.simulate([setting], [START[0][:1]], [START[1][:1]], [window])[0]
     parts, _ = script_of(tmp_path, world, setting)
     script = in_script(tmp_path, parts, window.recording)
     np.testing.assert_allclose(script, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("actearly", ["false", "true"])
+@pytest.mark.parametrize("factor", [None, "control:m"])
+def test_a_force_over_a_drive_with_a_filter_of_its_own_is_of_what_is_sent(
+    tmp_path, actearly, factor
+):
+    """What the simulator fitted it over; only `lag` comes before it."""
+    world, _ = driven_by(FILTER.replace("/>", f' actearly="{actearly}"/>'))
+    curve = world.curve("j", "position:j" if factor else "control:m", (-1.0, 0.0, 1.0), factor)
+    ctrl = np.random.default_rng(0).uniform(-1, 1, (ROWS, 1))
+    window, setting = Window(commanded(DT * np.arange(ROWS), ctrl), 0, ROWS - 1), {curve: CURVE}
+    (expected,) = world.simulate([setting], [START[0][:1]], [START[1][:1]], [window])[0]
+    parts, _ = script_of(tmp_path, world, setting)
+    script = in_script(tmp_path, parts, window.recording)
+    np.testing.assert_allclose(script, expected, rtol=0, atol=1e-9)
+    model = world.model
+    batch, data = CorrectedBatch(model, 1, 1, parts=parts), mujoco.MjData(model)
+    batch.bind("ctrl")[:] = data.ctrl[:] = 1.0
+    batch.step(nstep=20)
+    module_of(parts, ["j"]).step(model, data, 20)
+    np.testing.assert_allclose(batch.bind("qpos")[0], data.qpos, rtol=0, atol=1e-12)
 
 
 def test_stamps_since_1970_keep_the_clock_and_the_delays(tmp_path):
