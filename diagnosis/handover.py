@@ -15,7 +15,7 @@ import numpy as np
 
 from diagnosis.estimation import windowing
 from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predictions, python_parts
-from diagnosis.simulation.corrected_template import divided
+from diagnosis.simulation.corrected_template import blown_up, divided
 from diagnosis.simulation.editable_model import FILTERS
 
 SCATTER = 2.0  # standard deviations that are taken for chance
@@ -179,7 +179,7 @@ def compiled(xml):
 
 def in_stock_mujoco(model, nominal, windows):
     """qpos (W, T, nq) of windows that follow each other, each begun as recorded; NaN where there is
-    none.
+    none, and in what is left of one that blew up.
 
     Joints and actuators go by the nominal model's names; what the model appends, its actuators'
     states and delayed controls run on through each recording.
@@ -209,6 +209,7 @@ def in_stock_mujoco(model, nominal, windows):
                 gap = recording.time[row + 1] - recording.time[row]
                 count, model.opt.timestep = divided(gap, length)  # as corrected.py
                 mujoco.mj_step(model, data, nstep=count)
+                now = None if blown_up(data) else now
     model.opt.timestep = length
     return out
 

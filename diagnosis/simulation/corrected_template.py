@@ -78,6 +78,7 @@ class Look:
 
 
 FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+BAD = [getattr(mujoco.mjtWarning, f"mjWARN_BAD{of}") for of in ("QPOS", "QVEL", "QACC")]
 
 
 def joint_id(model, name):
@@ -402,16 +403,26 @@ def run(model, data, ctrl, time):
     """Yields (qpos, qvel) at each time of time (T,), stepping on from data under ctrl (T, nu).
 
     data.time goes its own way: seconds since 1970 would round each of its steps, and delays ask
-    for equal ones.
+    for equal ones. NaN once it has blown up.
     """
     yield data.qpos.copy(), data.qvel.copy()
-    h = model.opt.timestep
+    h, sound = model.opt.timestep, True
     for u, now, seconds in zip(ctrl, time, np.diff(time)):
         steps, model.opt.timestep = divided(seconds, h)
         data.ctrl[: len(u)] = u
         step(model, data, steps, now - data.time)
         model.opt.timestep = h
-        yield data.qpos.copy(), data.qvel.copy()
+        sound = sound and not blown_up(data)
+        yield tuple(np.where(sound, x, np.nan) for x in (data.qpos, data.qvel))
+
+
+def blown_up(data):
+    """Whether MuJoCo met impossible states since this was last asked: it began anew then."""
+    met = [data.warning[kind] for kind in BAD]
+    found = any(warning.number for warning in met)
+    for warning in met:
+        warning.number = 0
+    return found
 
 
 def divided(seconds, h):

@@ -60,6 +60,22 @@ def test_the_error_of_the_files_is_that_of_the_simulator_that_fitted_them(kept_b
         assert check.error(Files.of(world, some)) == pytest.approx(own, rel=1e-4)
 
 
+@pytest.mark.parametrize("form", ["mjcf", "python"])
+def test_files_that_blow_up_predict_nothing_until_the_next_window(kept_back, form):
+    """MuJoCo begins anew then, and goes on with numbers that mean nothing."""
+    world, check = kept_back
+    setting = {world.candidate("stiffness", "pivot"): (1e9,)}
+    if form == "python":
+        setting = {
+            world.curve("pivot", "position:pivot", (-1e9, 1e9), "speed:pivot"): (-1e15, 1e15)
+        }
+    files = Files.of(world, setting)
+    assert set(files.forms.values()) == {form}
+    qpos = files.predicted(world.model, check.windows)
+    assert np.isfinite(qpos[:, 0]).all() and np.isnan(qpos[:, -1]).all()
+    assert check.error(files) == np.inf
+
+
 def test_files_hold_what_mjcf_cannot_in_a_script():
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     run = recorded("run.csv", 1, seconds=2.0)
