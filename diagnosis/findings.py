@@ -49,7 +49,7 @@ def assemble(world, train, held_out, outcome):
     figures["held_out"]["horizon_s"] = windowing.HORIZON
     check = outcome.held_check
     figures["held_out"]["curve"] = windowing.curve(
-        world, settings, check.smoother, check.trajectory, check.noise
+        world, _files(handed), settings, check.smoother, check.trajectory, check.noise
     )
     if others := sensor_faults.errors(world, settings, check.recordings):
         figures["held_out"]["sensors"] = others
@@ -234,12 +234,16 @@ def noise_by_channel(model, position_noise):
     }
 
 
+def _files(handed):
+    return {"before": handed.nominal, "after": handed.files}
+
+
 def _figure(world, handed: Handed, check, settings):
     """Errors before, after (of the files handed over, in stock MuJoCo) and of a perfect simulator,
     as diagnosis.json has them."""
     model = world.model
     out, channels = {}, {}
-    for name, files in (("before", handed.nominal), ("after", handed.files)):
+    for name, files in _files(handed).items():
         out[name], per_channel = check.errors(files)
         for channel, value in per_channel.items():
             channels.setdefault(channel, {})[name] = value

@@ -224,23 +224,24 @@ def reporting_noise(position_noise):
     return np.where(np.isfinite(position_noise), np.maximum(position_noise, 1e-12), 1.0)
 
 
-def curve(world, settings, smoother, trajectory, noise, longest=3 * HORIZON, points=15):
+def curve(world, files, settings, smoother, trajectory, noise, longest=3 * HORIZON, points=15):
     """[{"seconds": t, "before":, "after":, "floor": error at t after the start}, ...], in noises, t
-    up to `longest`. Windows in which a prediction blew up by then are left out, and counted with
-    all that were measured then: "blown_up": {"before":, "after":, "of":}."""
+    up to `longest`. files {"before":, "after":}: predicted(model, windows) gives their qpos (W, T,
+    nq); settings: of the truth that the floor stands for, and of `trajectory`. Windows in which a
+    prediction blew up by then are left out, and counted with all that were measured then:
+    "blown_up": {"before":, "after":, "of":}."""
     windows = cut(smoother.recordings, longest)
     seconds = [w.recording.time[w.first : w.last + 1] - w.recording.time[w.first] for w in windows]
     sample = np.median([s[-1] / (len(s) - 1) for s in seconds])
     most = max(1, round(max(s[-1] for s in seconds) / sample))
     seen = known(world.model, windows)
     miss = lambda qpos: difference(world.model, qpos, measured(windows))
-    both = {"before": {}, "after": settings}
-    gaps = {name: miss(predict(world, s, windows)[0]) for name, s in both.items()}
+    gaps = {name: miss(each.predicted(world.model, windows)) for name, each in files.items()}
     gaps["floor"] = floor_gaps(world, settings, smoother, trajectory, longest)
     out = []
     for time in sample * np.unique(np.linspace(1, most, min(points, most)).round()):
         rows = np.array([_row_at(s, time) for s in seconds])  # recordings may differ in their rates
-        there, then = _at(seen, rows), {name: _at(gaps[name], rows) for name in both}
+        there, then = _at(seen, rows), {name: _at(gaps[name], rows) for name in files}
         entry = {"seconds": float(time)}
         lost = {k: int((there & ~np.isfinite(gap)).any(1).sum()) for k, gap in then.items()}
         if any(lost.values()):

@@ -10,6 +10,7 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded, reported_error
 
 from diagnosis.estimation import windowing
 from diagnosis.estimation.smoother import Smoother
+from diagnosis.handover import Files
 from diagnosis.simulation.simulator import World
 
 
@@ -42,21 +43,16 @@ def test_error_is_that_of_stock_mujoco():
 def test_windows_that_blow_up_are_counted_beside_the_curve():
     run = recorded("run.csv", 5)
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
-    true, smoother = world.simulate, Smoother(world, [run])
+    smoother, files = Smoother(world, [run]), {"before": Files.of(world, {})}
     trajectory = smoother.locate({})
 
-    def bursts(
-        settings, qpos, qvel, windows, *more, **options
-    ):  # under the correction, in every other window from 0.4 s on
-        out = true(settings, qpos, qvel, windows, *more, **options)
-        out[0][[i for i, w in enumerate(windows) if settings[i] and w.first // 90 % 2], 41:] = (
-            np.nan
-        )
+    def bursts(nominal, windows):  # in every other window from 0.4 s on
+        out = files["before"].predicted(nominal, windows)
+        out[[i for i, w in enumerate(windows) if w.first // 90 % 2], 41:] = np.nan
         return out
 
-    world.simulate = bursts
-    mass = {world.candidate("mass", "arm"): (0.5001,)}
-    rows = windowing.curve(world, mass, smoother, trajectory, np.array([NOISE]))
+    files["after"] = SimpleNamespace(predicted=bursts)
+    rows = windowing.curve(world, files, {}, smoother, trajectory, np.array([NOISE]))
     assert [row["seconds"] > 0.405 for row in rows] == ["blown_up" in row for row in rows]
     assert rows[-1]["blown_up"] == {"before": 0, "after": 2, "of": 4}
     assert all(row["after"] == pytest.approx(row["before"], rel=0.5) for row in rows)
@@ -78,7 +74,10 @@ def test_the_curve_goes_by_time_whatever_the_sampling():
     ]
     smoother = Smoother(world, [fast, *slower])
     noise = np.array([NOISE])
-    entries = windowing.curve(world, {}, smoother, smoother.locate({}), noise)
+    off = lambda nominal, windows: windowing.measured(windows) + 3 * NOISE
+    files = {"before": Files.of(world, {}), "after": SimpleNamespace(predicted=off)}
+    entries = windowing.curve(world, files, {}, smoother, smoother.locate({}), noise)
+    assert all(entry["after"] == pytest.approx(3) for entry in entries)
     windows = windowing.cut([fast, *slower], 0.9)
     qpos = windowing.predict(world, {}, windows)[0]
     assert entries[-1]["seconds"] == pytest.approx(0.9, abs=0.05)
