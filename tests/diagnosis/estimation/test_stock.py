@@ -56,7 +56,7 @@ def test_a_script_that_adds_nothing_predicts_the_same(step, row):
     ctrl = np.random.default_rng(0).uniform(-1, 1, (101, 1))
     recording = Recording("r.csv", time, qpos, np.full((101, 2), np.nan), ctrl)
     windows = windowing.consecutive(recording)
-    found = stock.predicted(world.model, world.model, windows)
+    found = handover.in_stock_mujoco(world.model, world.model, windows)
     rows = [(w.first, w.last) for w in windows]
     states = windowing.states(world.model, recording)
     expected = module_of([], ["j", "k"]).predict(world.model, time, *states, ctrl, rows)
