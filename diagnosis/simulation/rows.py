@@ -16,6 +16,7 @@ from diagnosis.simulation.simulator import Case
 
 INPUT = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 BODIES = int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
+STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS  # time, qpos, qvel, act, and what else MuJoCo remembers
 CHUNK = 40000  # simulations in memory at a time
 STEPS = 2  # coarse ones in a row
 SWING = 0.3  # rad of phase, or share of the decay, of the fastest joint's motion in a coarse step
@@ -79,6 +80,8 @@ class RowMap:
         if model is None:
             raise ValueError("MuJoCo refuses these values")
         self.model, self.bias = model, (None, None, None)
+        self.rest = np.empty(mujoco.mj_stateSize(model, STATE))
+        mujoco.mj_getState(model, mujoco.MjData(model), self.rest, STATE)
         self.constant, self.xfrc = np.zeros(model.nv), np.zeros((model.nbody, 6))
         for c, values in case.on:
             i = c.effect.id(model, c.place.name)
@@ -155,7 +158,8 @@ class RowMap:
     def _rollout(self, index, qpos, qvel, force, count):
         """As _rolled, of rows that take no more steps than `count`."""
         m, n = self.model, len(index)
-        state = np.concatenate([np.zeros((n, 1)), qpos, qvel, self.activation[index]], 1)
+        state = np.tile(self.rest, (n, 1))
+        state[:, 1 : 1 + m.nq + m.nv + m.na] = np.hstack([qpos, qvel, self.activation[index]])
         control = self.control[index, :count]
         given = [np.repeat(force[:, None], count, 1)]
         given += [np.tile(self.xfrc.ravel(), (n, count, 1))] if self.xfrc.any() else []

@@ -187,3 +187,15 @@ def test_derivatives_by_force_work_out_no_load_again(monkeypatch):
     count, nv = len(rows.begin), here.model.nv
     rows.linearised(*some_states(here.model, count), np.ones(nv), np.zeros(count, bool))
     assert len(asked) == (1 + 2 * nv) * count
+
+
+def test_sensors_that_are_late_or_rarely_read_change_no_row():
+    """What they remember is part of MuJoCo's state beside positions, velocities and activations."""
+    xml = ARM.format(damping=0.05, kp=8)
+    late = '<sensor><jointpos joint="j" nsample="5" delay="0.004"/></sensor></mujoco>'
+    both = [World(mujoco.MjSpec.from_string(x)) for x in (xml, xml.replace("</mujoco>", late))]
+    assert both[1].model.nhistory
+    run = uneven(both[0].model)
+    state = some_states(both[0].model, 11)
+    plain, other = (RowMap(w, [run], {}).ahead(np.arange(11), *state) for w in both)
+    np.testing.assert_array_equal(plain, other)
