@@ -77,6 +77,41 @@ def integrate(model, qpos, step):
     return out
 
 
+def _filled(time, column, default):
+    good = np.isfinite(column)
+    return np.interp(time, time[good], column[good]) if good.any() else np.full(len(time), default)
+
+
+def states(model, recording):
+    """Recorded states without holes: qpos (T, nq); qvel (T, nv) as measured, else by central
+    difference. What was never measured is made up: positions by summing measured velocities from
+    the model's qpos0, else qpos0 and rest."""
+    time = recording.time
+    qpos, qvel = np.array(recording.qpos, float), np.array(recording.qvel, float)
+    for _, kind, q, v in joint_slices(model):
+        rotation = kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+        quat = qpos[:, q.stop - 4 : q.stop] if rotation else None
+        if rotation:  # q and -q are one: between holes too
+            known = np.flatnonzero(np.isfinite(quat).all(1))
+            quat[known[1:]] *= np.where(
+                np.cumsum((quat[known[1:]] * quat[known[:-1]]).sum(1) < 0) % 2, -1.0, 1.0
+            )[:, None]
+        for i in range(q.start, q.stop):
+            if np.isfinite(qpos[:, i]).any() or rotation:
+                qpos[:, i] = _filled(time, qpos[:, i], model.qpos0[i])
+            else:
+                speed = _filled(time, qvel[:, v.start], 0.0)
+                qpos[:, i] = model.qpos0[i] + np.concatenate(
+                    [[0], np.cumsum(speed[:-1] * np.diff(time))]
+                )
+        if rotation:
+            quat /= np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), 1e-9)
+    before = np.maximum(np.arange(len(time)) - 1, 0)
+    after = np.minimum(np.arange(len(time)) + 1, len(time) - 1)
+    central = difference(model, qpos[before], qpos[after]) / (time[after] - time[before])[:, None]
+    return qpos, np.where(np.isfinite(qvel), qvel, central)
+
+
 def joint_name(model, joint):
     """What columns call a joint: its name, or its index where it has none."""
     return model.joint(joint).name or str(joint)

@@ -10,13 +10,19 @@ A window is (recording, first row, last row), both rows inside. Position differe
 tangent space of the joints (nv numbers), so that quaternions need no special case further up.
 """
 
-import mujoco
 import numpy as np
 
-from diagnosis.common.coordinates import channels, difference, integrate, joint_name, joint_slices
+from diagnosis.common.coordinates import (
+    channels,
+    difference,
+    integrate,
+    joint_name,
+    joint_slices,
+    states,
+)
 from diagnosis.simulation.simulator import Window
 
-__all__ = ["channels", "difference", "integrate", "joint_name", "joint_slices"]
+__all__ = ["channels", "difference", "integrate", "joint_name", "joint_slices", "states"]
 
 HORIZON = 0.3  # s, of the error that is reported
 ENDLESS = 1e100  # m or rad: whoever is farther off is nowhere
@@ -36,42 +42,6 @@ def sampling(recordings):
 def evenly(number, most):
     """At most so many of 0 .. number - 1, evenly spread: indices, ascending."""
     return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(int))
-
-
-# ---- states ------------------------------------------------------------------------------------
-
-
-def _filled(time, column, default):
-    good = np.isfinite(column)
-    return np.interp(time, time[good], column[good]) if good.any() else np.full(len(time), default)
-
-
-def states(model, recording):
-    """Recorded states without holes: qpos (T, nq); qvel (T, nv) as measured, else by central
-    difference. What was never measured is made up: positions by summing measured velocities from
-    the model's qpos0, else qpos0 and rest."""
-    time = recording.time
-    qpos, qvel = np.array(recording.qpos, float), np.array(recording.qvel, float)
-    for _, kind, q, v in joint_slices(model):
-        rotation = kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
-        quat = qpos[:, q.stop - 4 : q.stop] if rotation else None
-        if rotation:  # q and -q are one: between holes too
-            known = np.flatnonzero(np.isfinite(quat).all(1))
-            turned = np.cumsum((quat[known[1:]] * quat[known[:-1]]).sum(1) < 0) % 2
-            quat[known[1:]] *= np.where(turned, -1.0, 1.0)[:, None]
-        for i in range(q.start, q.stop):
-            if np.isfinite(qpos[:, i]).any() or rotation:
-                qpos[:, i] = _filled(time, qpos[:, i], model.qpos0[i])
-            else:
-                speed = _filled(time, qvel[:, v.start], 0.0)
-                gone = np.cumsum(speed[:-1] * np.diff(time))
-                qpos[:, i] = model.qpos0[i] + np.concatenate([[0], gone])
-        if rotation:
-            quat /= np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), 1e-9)
-    before = np.maximum(np.arange(len(time)) - 1, 0)
-    after = np.minimum(np.arange(len(time)) + 1, len(time) - 1)
-    central = difference(model, qpos[before], qpos[after]) / (time[after] - time[before])[:, None]
-    return qpos, np.where(np.isfinite(qvel), qvel, central)
 
 
 def consecutive(recording, horizon=HORIZON, first=0, end=None):

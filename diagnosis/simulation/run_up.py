@@ -4,14 +4,17 @@ recorded.
 qpos, qvel, act = run_up(engine, cases, windows, begin, measures, step)
 
 Each case runs once through each stretch of a recording and is brought back to it every RETURN
-seconds, while what is hidden runs on. That begins at rest, or where the returns of the first SETTLE
-seconds speak for it: as with any observer, what is hidden shows in how far they miss.
+seconds, where it was measured about then, while what is hidden runs on. That begins at rest, or
+where the returns of the first SETTLE seconds speak for it: as with any observer, what is hidden
+shows in how far they miss.
 """
+
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 
-from diagnosis.common.coordinates import difference
+from diagnosis.common.coordinates import difference, states
 from diagnosis.common.distributions import f_sf
 
 RETURN = 0.1  # seconds between returns to the record
@@ -43,9 +46,12 @@ class _Follower:
         self.engine, self.cases, self.recordings, self.step = engine, cases, recordings, step
         self.time = np.array([r.time[row] for r, row in zip(recordings, rows)])
         self.settled = max(int((self.time - self.time[:, :1] <= SETTLE).sum(1).max()) - 1, 0)
-        first = [_recorded(engine.nominal, r, row[0]) for r, row in zip(recordings, rows)]
+        filled = {r: _filled(engine.nominal, r) for r in dict.fromkeys(recordings)}
+        first = [
+            _recorded(engine.nominal, filled[r][0], row[0]) for r, row in zip(recordings, rows)
+        ]
         self.first = engine.true(*map(np.array, zip(*first)), measures)  # (n, nq), (n, nv)
-        shown = np.array([r.qpos[row] for r, row in zip(recordings, rows)])
+        shown = np.array([filled[r][1][row] for r, row in zip(recordings, rows)])
         still = np.zeros((len(shown), engine.nominal.nv))
         self.qpos = [engine.true(q, still, measures)[0] for q in np.swapaxes(shown, 0, 1)]
 
@@ -113,9 +119,11 @@ class _Follower:
 
     def _return(self, qpos, qvel, shown_qpos, shown_qvel):
         """Bring states back to what is shown, where it is known."""
-        known = np.isfinite(shown_qpos).all(1) & np.isfinite(shown_qvel).all(1)
-        qpos[np.ix_(known, self.engine.q)] = shown_qpos[known]
-        qvel[np.ix_(known, self.engine.v)] = shown_qvel[known]
+        for state, index, shown in (
+            (qpos, self.engine.q, shown_qpos),
+            (qvel, self.engine.v, shown_qvel),
+        ):
+            state[:, index] = np.where(np.isfinite(shown), shown, state[:, index])
 
 
 def _no_chance(before, after, number):
@@ -150,6 +158,19 @@ def _onward(engine, cases, recordings, now, then, states, step):
     for state, run in zip(states, (q, v, a)):
         run = run[np.arange(len(on)), steps[on]]
         state[on] = np.where(np.isfinite(run).all(axis=1, keepdims=True), run, state[on])
+
+
+def _filled(model, recording):
+    """(a Recording without holes, its qpos (T, nq) with NaN in those longer than RETURN)."""
+    if np.isfinite(recording.qpos).all():
+        return recording, recording.qpos
+    qpos, qvel = states(model, recording)
+    time, shown = recording.time, qpos.copy()
+    for known, column in zip(np.isfinite(recording.qpos).T, shown.T):
+        ends = np.concatenate([[-np.inf], time[known], [np.inf]])
+        after = np.searchsorted(ends, time)
+        column[~known & (ends[after] - ends[after - 1] > RETURN)] = np.nan
+    return replace(recording, qpos=qpos, qvel=qvel), shown
 
 
 def _recorded(model, recording, row):

@@ -103,3 +103,30 @@ def test_a_short_recording_says_nothing_of_how_it_began(world, rows):
     starts = some.qpos[:1], qvel[:1]
     predicted = world.simulate([setting], *starts, [Window(some, 0, rows - 1)])[0]
     assert np.isfinite(predicted).all()
+
+
+def beside(world):
+    """World of the arm beside a second one, on a motor of its own."""
+    other = "<body><joint name='k' axis='0 1 0' damping='.02'/><geom size='.1'/></body></worldbody>"
+    xml = ARM.replace("</worldbody>", other)
+    xml = xml.replace("</actuator>", "<motor name='other' joint='k'/></actuator>")
+    return World(mujoco.MjSpec.from_string(xml))
+
+
+@pytest.mark.parametrize("measured", ["in turns", "one never"])
+def test_a_joint_is_brought_back_where_another_was_not_measured(world, measured):
+    _, one, qvel = run(world, "joint_elasticity")
+    one, qvel, two = one.part(25, None), qvel[25:], beside(world)
+    still = np.zeros_like(one.qpos)
+    qpos, ctrl = np.hstack([one.qpos, still]), np.hstack([one.ctrl, still])
+    qpos[1::2, 0] = qpos[::2, 1] = np.nan
+    if measured == "one never":
+        qpos[:, 0], qpos[:, 1] = one.qpos[:, 0], np.nan
+    both = Recording("run", one.time, qpos, np.full_like(qpos, np.nan), ctrl)
+    setting = {two.candidate("joint_elasticity", "elbow"): VALUES["joint_elasticity"]}
+    rows = [77, 104]
+    windows = [Window(both, r, r + AHEAD) for r in rows]
+    starts = np.hstack([one.qpos, still])[rows], np.hstack([qvel, still])[rows]
+    predicted = two.simulate([setting] * 2, *starts, windows)[0][..., 0]
+    measured = np.array([one.qpos[r : r + AHEAD + 1, 0] for r in rows])
+    assert np.sqrt(np.mean((predicted - measured) ** 2)) < 8e-3
