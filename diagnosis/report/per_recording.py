@@ -27,10 +27,11 @@ def with_each_recording(world, settings: dict, recordings: list, summary: dict) 
     """The summary whose findings have `per_recording` and `constancy`, those that can be simulated,
     and whose warnings name what is not one value, with the variable that it goes along with.
 
-    settings: {Candidate: values} of the findings; recordings: those fitted, R of them.
+    settings: {Candidate: values} of the findings; recordings: those fitted, R of them. Forces
+    without a name stay as they are, and have neither.
     """
-    known = {c: v for c, v in settings.items() if not c.when and c.effect.name != "unknown"}
-    if len(recordings) < 2 or not known:
+    known = {c: v for c, v in settings.items() if not c.when}
+    if len(recordings) < 2 or not any(map(_named, known)):
         return summary
     found = estimates(world, known, recordings, summary["noise"])
     names = [r.name for r in recordings]
@@ -47,8 +48,13 @@ def with_each_recording(world, settings: dict, recordings: list, summary: dict) 
     return {**summary, "findings": findings, "warnings": summary.get("warnings", []) + told}
 
 
+def _named(candidate):
+    return candidate.effect.name != "unknown"
+
+
 def _entries(finding, found, names, settings):
-    """(rows of per_recording, p of constancy: the smallest of its parameters') of one finding."""
+    """(rows of per_recording, p of constancy: the smallest of its parameters', None where no two
+    recordings show one) of one finding."""
     rows, p = [], []
     for (candidate, k), (values, errors) in found.items():
         place = candidate.place.kind, candidate.place.name
@@ -57,10 +63,10 @@ def _entries(finding, found, names, settings):
             {"kind": place[0], "name": place[1]},
         ):
             continue
-        p.append(constancy(values, errors))
-        for name, value, error in zip(names, values, errors):
-            size = max(abs(settings[candidate][k]), abs(value) - 2 * error)
-            shown = np.isfinite(value) and error < UNSEEN * size
+        size = np.maximum(abs(settings[candidate][k]), abs(values) - 2 * errors)
+        known = np.isfinite(values) & (errors < UNSEEN * size)
+        p += [constancy(values, errors)] if known.sum() > 1 else []
+        for name, value, error, shown in zip(names, values, errors, known):
             rows.append(
                 {
                     "recording": name,
@@ -96,9 +102,11 @@ def estimates(world, settings: dict, recordings: list, noise: dict) -> dict:
 
 
 def _cases(settings):
-    """(labels, [(setting, step)]): that of all, then with a step in each parameter."""
+    """(labels, [(setting, step)]): that of all, then with a step in each parameter with a name."""
     labels, cases = [], [(settings, 0.0)]
     for candidate, values in settings.items():
+        if not _named(candidate):
+            continue
         for k, (parameter, value) in enumerate(zip(candidate.parameters, values)):
             if not np.isfinite(value):
                 continue

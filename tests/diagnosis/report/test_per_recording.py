@@ -16,12 +16,12 @@ STIFF = 'solreffriction="0.004 1" solimpfriction="0.999 0.9999 0.001"'
 NOISE = {"qpos:shoulder": 2e-4, "qpos:elbow": 2e-4}
 
 
-def recorded(friction, seed, damping=0.05):
-    """A run of ARM with friction in its elbow and another damping in its shoulder."""
+def recorded(friction, seed, damping=0.05, stiffness=0.0):
+    """A run of ARM with friction in its elbow, and a spring and another damping in its shoulder."""
     xml = ARM.replace('name="elbow" axis', f'name="elbow" frictionloss="{friction}" {STIFF} axis')
     xml = xml.replace(
         'name="shoulder" axis="0 1 0" damping="0.05"',
-        f'name="shoulder" axis="0 1 0" damping="{damping}"',
+        f'name="shoulder" axis="0 1 0" damping="{damping}" stiffness="{stiffness}"',
     )
     model, rng = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(seed)
     data, time = mujoco.MjData(model), 0.01 * np.arange(600)
@@ -91,6 +91,7 @@ def test_what_a_recording_does_not_show_is_null(world):
     friction, _ = with_each_recording(world, settings(world), runs, summary())["findings"]
     assert friction["per_recording"][0]["value"] is not None
     assert friction["per_recording"][1]["value"] is None
+    assert friction["constancy"] is None  # one value has nothing to agree with
     alone = with_each_recording(world, settings(world), runs[:1], summary())
     assert "per_recording" not in alone["findings"][0]
     assert with_each_recording(world, {}, runs, summary()) == summary()
@@ -113,3 +114,15 @@ def test_noisy_starts_shift_no_recordings_value():
     for (candidate, k), (values, errors) in estimates(world, truth, runs, noise).items():
         assert (abs(values - truth[candidate][k]) < 4 * errors).all()
         assert constancy(values, errors) > 0.01
+
+
+def test_a_force_without_a_name_stays_as_the_diagnosis_has_it(world):
+    """Values beside it are those of the motion that it leaves; its own are not asked for."""
+    curve = world.curve("shoulder", "position:shoulder", (-9.0, 9.0))
+    runs = [recorded(0.05, seed, damping=0.06, stiffness=2.0) for seed in range(2)]
+    found = settings(world) | {curve: (18.0, -18.0)}
+    told = with_each_recording(world, found, runs, summary())["findings"]
+    for finding, true in zip(told, (0.05, 0.06)):
+        assert all(abs(row["value"] / true - 1) < 0.2 for row in finding["per_recording"])
+    only = {curve: (18.0, -18.0)}
+    assert with_each_recording(world, only, runs, summary()) == summary()
