@@ -113,9 +113,8 @@ class DeadZone(ActuatorEffect):
     acts_through = "control"
 
     def fits(self, model, i):
-        motor = model.actuator_gainprm[i, 0] and not self.servo(model, i)
-        return super().fits(model, i) and (
-            motor
+        return bool(super().fits(model, i) and model.actuator_gainprm[i, 0]) and (
+            not self.servo(model, i)
             or self.on_joint(model, i)
             and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
         )
@@ -162,7 +161,10 @@ class DeadZone(ActuatorEffect):
 
 
 class DriveLimit(ActuatorEffect):
-    """What a motor or servo on a hinge or slide, without a filter of its own, cannot give."""
+    """What a motor or servo on a hinge or slide, without a filter of its own, cannot give.
+
+    Its control alone gives a force, by which sizes are chosen: that of a <damper> gives none.
+    """
 
     law, acts_through = "", "control"
 
@@ -171,6 +173,7 @@ class DriveLimit(ActuatorEffect):
             super().fits(model, i)
             and self.on_joint(model, i)
             and model.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
+            and model.actuator_gainprm[i, 0]
         )
 
     def write(self, spec, model, i, values):

@@ -13,6 +13,7 @@ from plants import (
     WEAKER,
     arm,
     commanded,
+    driven_by,
     pendulum,
     record,
     simulate,
@@ -463,3 +464,17 @@ def test_a_limited_rate_passes_delays_and_lags_on():
     )  # not yet quite at rest
     again = replace(signal, lag=0.02).sample(0.3, 0.003, 40, True)
     np.testing.assert_allclose(again, slow[100:140], atol=1e-9)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "passive",
+    [
+        '<damper name="m" joint="j" kv="0.4" ctrlrange="0 1"/>',
+        '<general name="m" joint="j" gainprm="0" biastype="affine" biasprm="0 -3 -0.1"/>',
+    ],
+)
+def test_an_actuator_whose_control_gives_no_force_at_rest_has_no_limits_of_a_drive(passive):
+    world, _ = driven_by(passive)
+    of_drives = {"dead_zone", "rate_limit", "torque_speed", "gain_fade"}
+    assert not of_drives & {c.effect.name for c in world.candidates if c.place.name == "m"}
