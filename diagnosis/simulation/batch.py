@@ -127,7 +127,7 @@ class Engine:
 
         act (n, na): activations, of which those count that the nominal model lacks; zero if not
         given. Returns q (n, 1 + count, nq), v (n, 1 + count, nv), sensordata (n, 1 + count, ·) or
-        None, act (n, 1 + count, na); NaN after the first state of a simulation that failed.
+        None, act (n, 1 + count, na); NaN from the step on at which a simulation failed.
         """
         n, memo, drive = len(cases), {}, self.working.drive
         on = [drive(c.on, r, t, step, count, memo) for c, r, t in zip(cases, recordings, begin)]
@@ -153,16 +153,16 @@ class Engine:
             failed = Stepwise(batch, cases, recordings, (on, off), begin, step).run(out)
         else:
             failed = self._rollout(batch, on, out)
-        failed |= batch.warning[:n, :, 1].any(axis=1)
-        failed |= np.array([a.model is None or b.model is None for a, b in zip(on, off)])
+        failed[[a.model is None or b.model is None for a, b in zip(on, off)]] = 0
+        lost = np.arange(count + sensors) >= failed[:, None]
         q = np.concatenate([qpos[:, None], out["qpos"][:, :count]], axis=1)
         v = np.concatenate([qvel[:, None], out["qvel"][:, :count]], axis=1)
-        q[failed, 1:] = v[failed, 1:] = np.nan
+        q[:, 1:][lost[:, :count]] = v[:, 1:][lost[:, :count]] = np.nan
         if sensors:
-            out["sensordata"][failed] = np.nan
+            out["sensordata"][lost] = np.nan
         if "act" in out:
             act = np.concatenate([act[:, None], out["act"][:, :count]], axis=1)
-            act[failed, 1:] = np.nan
+            act[:, 1:][lost[:, :count]] = np.nan
         else:
             act = np.zeros((n, 1 + count, self.model.na))
         return q, v, out.get("sensordata"), act
@@ -185,13 +185,15 @@ class Engine:
         return self.batch
 
     def _rollout(self, batch, drives, out):
-        """Run all steps in one call; fill out, return which simulations failed (n,)."""
-        n, failed = len(drives), np.zeros(len(drives), bool)
+        """Run all steps in one call; fill out, return the steps (n,) at which simulations failed,
+        `count` of those that did not."""
+        n = len(drives)
         batch.set_models([d.model or self.model for d in drives] + [self.model] * (batch.nsim - n))
         batch.bind("qfrc_applied")[:n] = [d.qfrc for d in drives]
         batch.bind("xfrc_applied")[:n] = [d.xfrc for d in drives]
         ctrl, count = np.array([d.ctrl for d in drives]), out["qpos"].shape[1]
         ctrl = np.pad(ctrl, ((0, 0), (0, count - ctrl.shape[1]), (0, 0)), mode="edge")
+        failed = np.full(n, count)
         try:
             batch.rollout(
                 count,
@@ -201,7 +203,11 @@ class Engine:
                 out=out,
             )
         except SimulationError as error:
-            failed[error.ids] = True
+            failed[error.ids] = 0
+        for s in np.flatnonzero(batch.warning[:n, :, 1].any(axis=1)):  # it repeats its last record
+            bits = np.concatenate([x[s].view(np.int64) for x in out.values()], axis=1)
+            moved = np.flatnonzero((bits != bits[-1]).any(axis=1))
+            failed[s] = min(failed[s], 1 + moved.max(initial=-1))
         return failed
 
     def _measures(self, cases):
@@ -241,7 +247,7 @@ def _read_sensors(data, time, step, measures):
     last = data.shape[1] - 1
     s, k, f = locate(np.maximum(time[..., None] - delay[:, None], 0.0) / step, last + 1)
     column = np.arange(delay.shape[1])
-    values = (1 - f) * data[s, k, column] + f * data[s, np.minimum(k + 1, last), column]
+    values = (1 - f) * data[s, k, column] + f * data[s, np.minimum(k + (f > 0), last), column]
     shown = values * ratio[:, None] + offset[:, None]
     return np.where(np.isnan(time)[..., None], np.nan, shown)
 

@@ -21,7 +21,7 @@ def read(model, q, v, time, step, delay):
     s, k, f = locate(x, q.shape[1])
     qpos, qvel = q[s, k], v[s, k]
     if f.any():
-        after, g = np.minimum(k + 1, q.shape[1] - 1), f[..., None]
+        after, g = np.minimum(k + (f > 0), q.shape[1] - 1), f[..., None]
         qpos, qvel = (1 - g) * qpos + g * q[s, after], (1 - g) * qvel + g * v[s, after]
         for j in range(model.njnt):
             a, d = model.jnt_qposadr[j], model.jnt_dofadr[j]
@@ -36,7 +36,7 @@ def read(model, q, v, time, step, delay):
         a, d = model.jnt_qposadr[j], model.jnt_dofadr[j]
         if f.any() or delay[:, c].any():
             s, k, part = locate(np.maximum(x - delay[:, c, None] / step, 0.0), q.shape[1])
-            after = np.minimum(k + 1, q.shape[1] - 1)
+            after = np.minimum(k + (part > 0), q.shape[1] - 1)
             qpos[..., a] = _cubic(q[..., a], v[..., d], s, k, part, step)
             qvel[..., d] = (1 - part) * v[s, k, d] + part * v[s, after, d]
     qpos[missing] = qvel[missing] = np.nan
@@ -56,6 +56,6 @@ def locate(x, length):
 def _cubic(q, v, s, k, f, step):
     """Cubic Hermite of positions q and velocities v (n, 1 + count) at fraction f between steps k
     and k + 1."""
-    after = np.minimum(k + 1, q.shape[1] - 1)
+    after = np.minimum(k + (f > 0), q.shape[1] - 1)
     q0, q1, v0, v1 = q[s, k], q[s, after], v[s, k] * step, v[s, after] * step
     return q0 + f * v0 + f**2 * (3 * (q1 - q0) - 2 * v0 - v1) + f**3 * (2 * (q0 - q1) + v0 + v1)

@@ -96,13 +96,13 @@ class Stepwise:
                 side.numbers[name] = np.tile(value, (len(side.qfrc), *[1] * value.ndim))
 
     def run(self, out):
-        """Step until out {field: (S, count, ...)} is full; returns which simulations failed
-        (S,)."""
+        """Step until out {field: (S, count, ...)} is full; returns the steps (S,) at which
+        simulations failed, `count` of those that did not."""
         batch, ids = self.batch, np.arange(len(self.begin), dtype=np.int32)
         live = {f: batch.bind(f) for f in {"ctrl", "qfrc_applied", "xfrc_applied", *out}}
         state = [batch.bind(f) for f in ("qpos", "qvel", "ctrl")]
         count, width = next(iter(out.values())).shape[1], self.sides[0].ctrl.shape[1]
-        failed, active = np.zeros(len(ids), bool), None
+        failed, active, warnings = np.full(len(ids), count), None, batch.warning[:, :, 1]
         for k in range(count):
             time = self.begin + k * self.step
             now = (self.low <= time) & (time < self.high)
@@ -123,7 +123,10 @@ class Stepwise:
             try:
                 batch.step(ids)
             except SimulationError as error:
-                failed[error.ids] = True
+                failed[error.ids] = np.minimum(failed[error.ids], k)
+            if warnings.any():
+                warned = warnings.any(axis=1)
+                failed[warned] = np.minimum(failed[warned], k)
             for f, values in out.items():
                 values[:, k] = live[f]
         return failed

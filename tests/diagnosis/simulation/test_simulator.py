@@ -403,6 +403,25 @@ def test_unstable_simulations_are_nan_and_silent(tmp_path, monkeypatch, capfd):
     )
 
 
+@pytest.mark.parametrize("effect", [None, "friction_map"])
+def test_what_blows_up_after_its_window_is_sound_within(effect):
+    """Beside a longer one, each simulation runs on beyond its end. One in one call, one step by
+    step."""
+    world, _ = driven_by('<general name="m" joint="j" biastype="affine" biasprm="0 0 2"/>')
+    setting = {world.candidate(effect, "j"): SIZES[effect]} if effect else {}
+    recording = commanded(np.arange(100) * 0.0105, np.zeros((100, 1)))
+    windows = [Window(recording, 0, last) for last in (*range(1, 40), 99)]
+    n = len(windows)
+    start = [np.full((n, 1), 0.3), np.full((n, 1), 0.5)]
+    together = world.simulate([setting] * n, *start, windows)
+    for k, window in enumerate(windows):
+        alone = world.simulate([setting], *(x[:1] for x in start), [window])
+        for a, b in zip(alone, together):
+            np.testing.assert_array_equal(a[0], b[k, : window.last + 1])
+    whole = np.isfinite(together[0][-1, :, 0])
+    assert whole[:20].all() and not whole[40:].any()
+
+
 def test_a_batch_is_its_members(case):
     """Mixed windows and settings in one call, each as if simulated alone."""
     world, _, recording = case
