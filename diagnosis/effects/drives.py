@@ -72,15 +72,18 @@ def joint_limit(models, j):
     return lambda force: np.clip(force, low, high)
 
 
+def controlled(model, j):
+    """Ids of the actuators of joint j that have a control."""
+    own = (model.actuator_trntype == JOINT_TRANSMISSION) & (model.actuator_trnid[:, 0] == j)
+    return np.flatnonzero(own & (model.actuator_ctrlnum > 0)).tolist()
+
+
 def drives_of(model, j):
-    """Ids of the actuators of joint j whose force follows from position, speed and control
-    alone."""
+    """Those of them whose force follows from position, speed and control alone."""
     return [
         a
-        for a in range(model.nactuator)
-        if model.actuator_trntype[a] == JOINT_TRANSMISSION
-        and model.actuator_trnid[a, 0] == j
-        and model.actuator_ctrlnum[a] == 1
+        for a in controlled(model, j)
+        if model.actuator_ctrlnum[a] == 1
         and model.actuator_gaintype[a] in (0, 1)
         and model.actuator_biastype[a] in (0, 1)
         and model.actuator_dyntype[a] == int(mujoco.mjtDyn.mjDYN_NONE)

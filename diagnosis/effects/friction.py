@@ -15,7 +15,7 @@ from diagnosis.effects.base import (
     Place,
     catalogue,
 )
-from diagnosis.effects.drives import drive_torque, drives_of
+from diagnosis.effects.drives import controlled, drive_torque, drives_of
 from diagnosis.effects.joints import (
     SOLIMP_FRICTION,
     SOLREF_FRICTION,
@@ -151,7 +151,8 @@ class LoadFriction(DryFriction):
     name, law, amplitudes = "load_friction", "load_friction", 2
 
     def fits(self, model, i):
-        return super().fits(model, i) and bool(drives_of(model, i))
+        drives = drives_of(model, i)
+        return super().fits(model, i) and bool(drives) and drives == controlled(model, i)
 
     def parameters(self, model, i):
         return (

@@ -478,3 +478,10 @@ def test_an_actuator_whose_control_gives_no_force_at_rest_has_no_limits_of_a_dri
     world, _ = driven_by(passive)
     of_drives = {"dead_zone", "rate_limit", "torque_speed", "gain_fade"}
     assert not of_drives & {c.effect.name for c in world.candidates if c.place.name == "m"}
+
+
+@pytest.mark.parametrize("beside, there", [("dyntype='filter' dynprm='0.05'", False), ("", True)])
+def test_friction_of_the_load_needs_the_force_of_every_drive_of_its_joint(beside, there):
+    """That of a filter beside a motor does not follow from control and state alone."""
+    world, _ = driven_by(f'<motor name="m" joint="j"/><general name="f" joint="j" {beside}/>')
+    assert ("load_friction" in {c.effect.name for c in world.candidates}) == there
