@@ -231,9 +231,7 @@ class World:
         held. Values keep all their digits; paths of meshes and other files become absolute.
         """
         spec, written = self.spec.copy(), {candidate: "mjcf" for candidate in setting}
-        # the time step first: delays, lags and friction are written by it
-        last = lambda item: not item[0].effect.numerical
-        for candidate, values in sorted(Case(self.model, setting, 1).on, key=last):
+        for candidate, values in sorted(Case(self.model, setting, 1).on, key=_when_written):
             i = candidate.effect.id(self.model, candidate.place.name)
             held = "none" if candidate.when else candidate.effect.write(spec, self.model, i, values)
             written[candidate] = held
@@ -293,6 +291,13 @@ def _keep_compiled(spec, model):
             compiled = model.joint(joint.name)
             joint.stiffness = [compiled.stiffness[0], 0, 0]
             joint.damping, joint.springdamper = [compiled.damping[0], 0, 0], [0, 0]
+
+
+def _when_written(item):
+    """Key by which (candidate, values) are written: the time step first, then delays, of which the
+    shortest may refine it, then what is written by it."""
+    effect, values = item[0].effect, item[1]
+    return not effect.numerical, not effect.delays, values[0] if effect.delays else 0.0
 
 
 def step_of(model, setting):

@@ -403,6 +403,19 @@ def test_unstable_simulations_are_nan_and_silent(tmp_path, monkeypatch, capfd):
     )
 
 
+def test_delays_that_are_written_together_are_of_one_time_step():
+    """Half of which each is later in Runge-Kutta's method: of the step that the shortest asks
+    for."""
+    world, _ = arm("rk4")
+    late = {"push": 0.0113, "bend": 0.0023}
+    setting = {world.candidate("delay", name): (seconds,) for name, seconds in late.items()}
+    model = mujoco.MjModel.from_xml_string(world.corrected_xml(setting)[0])
+    assert model.opt.timestep == pytest.approx(world.model.opt.timestep / 2)
+    for name, seconds in late.items():
+        more = model.actuator_delay[model.actuator(name).id] - seconds
+        assert more == pytest.approx(model.opt.timestep / 2)
+
+
 @pytest.mark.parametrize("effect", [None, "friction_map"])
 def test_what_blows_up_after_its_window_is_sound_within(effect):
     """Beside a longer one, each simulation runs on beyond its end. One in one call, one step by
