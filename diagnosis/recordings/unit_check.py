@@ -45,17 +45,20 @@ def suspect(recording, model):
     actuator states or joints that were not measured, and where contacts act."""
     if model.na or model.nq == 0 or np.isnan(recording.qpos).all(axis=0).any():
         return None
+    unlike = np.ones(model.nv, bool)  # smoothed too much, a fast servo seems to turn round
     for half in HALVES:
         states = inverse_dynamics.smooth(model, recording, CENTRES, half)[1:]
         if len(states[0]) < 20:
             continue
         now = _imbalance(model, *states)
-        if not (now > UNLIKE).any():
+        unlike &= ~(now <= UNLIKE)
+        if not (unlike & (now > UNLIKE)).any():
             continue
         for reading in _readings(recording, model, states, half):
             before = now[reading.dofs]
-            if (before > UNLIKE).any():
-                bound = np.where(before > UNLIKE, before / reading.gain, np.maximum(before, LIKE))
+            wrong = unlike[reading.dofs] & (before > UNLIKE)
+            if wrong.any():
+                bound = np.where(wrong, before / reading.gain, np.maximum(before, LIKE))
                 if (_imbalance(model, *reading.states)[reading.dofs] < bound).all():
                     return reading.message
     return None

@@ -14,6 +14,7 @@ from arm import ARM, HEADER, archive, arm, run, text, whole
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from diagnosis.recordings import unit_check
 from diagnosis.recordings.columns import columns_of
 from diagnosis.recordings.plausibility import check
 from diagnosis.recordings.recording import Recording, RecordingError, accepted, load
@@ -438,6 +439,18 @@ def test_a_sign_is_beyond_doubt_where_most_recordings_have_it(model, wrong, beyo
             check(recordings, model)
     else:
         assert any(line.startswith(f"0.csv: {says}") for line in check(recordings, model))
+
+
+@pytest.mark.parametrize("short, doubt", [(0.9, "turned"), (0.2, None)])
+def test_a_law_that_holds_with_little_smoothing_is_not_doubted_with_much(
+    model, good, monkeypatch, short, doubt
+):
+    """Smoothed over more than a swing, a fast servo seems to move the other way."""
+    left = iter([short, 0.9, 0.9, 0.2] if doubt else [short, 0.9, 0.2])
+    turned = unit_check.Reading("turned", [1], 3, ("turned",))
+    monkeypatch.setattr(unit_check, "_readings", lambda *given: [turned])
+    monkeypatch.setattr(unit_check, "_imbalance", lambda *given: np.array([0.1, next(left)]))
+    assert unit_check.suspect(recording(good), model) == doubt
 
 
 @pytest.mark.parametrize(
