@@ -137,7 +137,7 @@ def _earned(search, judge, fitted):
 def _checked(search, found, fitted, others, log):
     """The Outcome so far: curves tried beside the names, and what is left."""
     world, train, judge = search.world, search.train, found.judge
-    fitted = _bare(search, found, fitted, log)
+    fitted = _one_curve(search, found, fitted, log)
     dependences = missing_force.dependences(world, found.first, train)
     trajectory = found.trajectory
     left = missing_force.dependences(world, trajectory, train)
@@ -153,8 +153,9 @@ def _checked(search, found, fitted, others, log):
         units = complexity([rest.candidate]) if mine else UNNAMED
         tries = [_beside(search, judge, finer, rest, PRICE * units)]
         alone = _instead(search, found, finer, mine, rest.joint) if mine else None
-        if alone and alone.loss < finer.loss:
-            tries += [alone] if search.no_chance(paired(finer.score, alone.score)) else []
+        better = alone and alone.loss < finer.loss
+        if better and search.no_chance(paired(finer.score, alone.score)):
+            tries.append(alone)
         beside = min(filter(None, tries), key=lambda f: f.loss, default=None)
         if not beside:
             continue
@@ -176,7 +177,7 @@ def _instead(search, found, fitted, names, joint):
     return found.judge.fit({**rest, curve.candidate: curve.values}, steps=2)
 
 
-def _bare(search, found, fitted, log):
+def _one_curve(search, found, fitted, log):
     """The Fitted set with one curve in the place of a curve and names of its joint, where these are
     not earned over it: beside a curve any name fits that it makes up for."""
     for joint in [c.place.name for c in fitted.setting if isinstance(c.effect, Unknown)]:

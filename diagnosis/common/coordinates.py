@@ -93,17 +93,15 @@ def states(model, recording):
         quat = qpos[:, q.stop - 4 : q.stop] if rotation else None
         if rotation:  # q and -q are one: between holes too
             known = np.flatnonzero(np.isfinite(quat).all(1))
-            quat[known[1:]] *= np.where(
-                np.cumsum((quat[known[1:]] * quat[known[:-1]]).sum(1) < 0) % 2, -1.0, 1.0
-            )[:, None]
+            turned = np.cumsum((quat[known[1:]] * quat[known[:-1]]).sum(1) < 0) % 2
+            quat[known[1:]] *= np.where(turned, -1.0, 1.0)[:, None]
         for i in range(q.start, q.stop):
             if np.isfinite(qpos[:, i]).any() or rotation:
                 qpos[:, i] = _filled(time, qpos[:, i], model.qpos0[i])
             else:
                 speed = _filled(time, qvel[:, v.start], 0.0)
-                qpos[:, i] = model.qpos0[i] + np.concatenate(
-                    [[0], np.cumsum(speed[:-1] * np.diff(time))]
-                )
+                gone = np.cumsum(speed[:-1] * np.diff(time))
+                qpos[:, i] = model.qpos0[i] + np.concatenate([[0], gone])
         if rotation:
             quat /= np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), 1e-9)
     before = np.maximum(np.arange(len(time)) - 1, 0)

@@ -49,9 +49,8 @@ def lost(models, a, change):
     model, force = models[0], actuator_force(models, a)
     j, gear = model.actuator_trnid[a, 0], model.actuator_gear[a, 0]
     d, within, asked = model.jnt_dofadr[j], joint_limit(models, j), asked_torque(models, j)
-    limited = any(
-        m.jnt_actfrclimited[j] for m in models
-    )  # else what all drives ask for is no matter
+    # only where a joint has a range does it matter what all its drives ask for
+    limited = any(m.jnt_actfrclimited[j] for m in models)
 
     def function(qpos, qvel, ctrl, time):
         out, state = np.zeros_like(qvel), (qpos, qvel, ctrl)

@@ -52,11 +52,11 @@ def suspect(recording, model):
             continue
         now = _imbalance(model, *states)
         unlike &= ~(now <= UNLIKE)
-        if not (unlike & (now > UNLIKE)).any():
+        doubted = unlike & (now > UNLIKE)
+        if not doubted.any():
             continue
         for reading in _readings(recording, model, states, half):
-            before = now[reading.dofs]
-            wrong = unlike[reading.dofs] & (before > UNLIKE)
+            before, wrong = now[reading.dofs], doubted[reading.dofs]
             if wrong.any():
                 bound = np.where(wrong, before / reading.gain, np.maximum(before, LIKE))
                 if (_imbalance(model, *reading.states)[reading.dofs] < bound).all():

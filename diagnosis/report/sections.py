@@ -278,7 +278,7 @@ def reads_files(xml: str) -> bool:
 
 def _names(recordings, most=12):
     """The names of recordings in a line; of a held-out tail, from when on."""
-    # a fixed format, for the clock may count from 1970
+    # a fixed format: the clock of a Recording made in Python may count from 1970
     begins = lambda r: f" from {r.time[r.start]:.2f} s on" if r.start else ""
     names = list(dict.fromkeys(r.name + begins(r) for r in recordings))
     more = f" and {len(names) - most} more" if len(names) > most else ""

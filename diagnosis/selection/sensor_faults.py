@@ -122,7 +122,8 @@ def faults(world, settings, train, trajectory, event=None):
 
         fits = [_fitted(world.candidate(fault, name), predict, target, group) for fault in FAULTS]
         fits.sort(key=lambda fit: fit[0])
-        best, *found = [finding(world.model, fit, noise_of(train, name), tests) for fit in fits]
+        noise = noise_of(train, name)
+        best, *found = [finding(world.model, fit, noise, tests) for fit in fits]
         if best:
             bound = (1 + SAME) ** 2 * fits[0][0]
             same = [_told(f) for f, fit in zip(found, fits[1:]) if f and fit[0] < bound]

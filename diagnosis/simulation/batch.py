@@ -244,10 +244,10 @@ def _read_sensors(data, time, step, measures):
     """(n, rows, nsensordata) that sensors show at times (n, rows) of data (n, steps, ·), at the
     state before each step."""
     offset, ratio, delay = measures
-    last = data.shape[1] - 1
-    s, k, f = locate(np.maximum(time[..., None] - delay[:, None], 0.0) / step, last + 1)
+    x = np.maximum(time[..., None] - delay[:, None], 0.0) / step
+    s, k, after, f = locate(x, data.shape[1])
     column = np.arange(delay.shape[1])
-    values = (1 - f) * data[s, k, column] + f * data[s, np.minimum(k + (f > 0), last), column]
+    values = (1 - f) * data[s, k, column] + f * data[s, after, column]
     shown = values * ratio[:, None] + offset[:, None]
     return np.where(np.isnan(time)[..., None], np.nan, shown)
 

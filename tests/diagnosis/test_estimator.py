@@ -230,7 +230,7 @@ def test_a_name_beside_a_curve_of_its_joint_has_to_be_earned_over_one_curve(
     asked = lambda search, found, fitted, names, joint: alone if {*names} == {curve, name} else None
     monkeypatch.setattr(estimator, "_instead", asked)
     search = SimpleNamespace(world=world, earned=lambda before, after: earned)
-    told = estimator._bare(search, None, both, lambda what: None)
+    told = estimator._one_curve(search, None, both, lambda what: None)
     assert told is (alone if bare else both)
 
 
