@@ -18,6 +18,7 @@ WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in 
 DEPTH = 4  # effects added in one round
 CHANCE = 0.05  # that forces speak against an effect by accident
 LEAST = 0.01  # loss that an effect must remove in the search
+ENDS = "low", "high"
 GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
 MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; new ones in each
 
@@ -172,7 +173,8 @@ class Beam:
     def gains(self, node):
         """{k: nats} that options of effects which a node does not hold promise, in a first look."""
         index, *_, precision, _ = problem(self.columns, node.options)
-        gain = self.evidence.looks(index, node.score.amounts, precision)
+        bounds = [np.concatenate([getattr(o, end) for o in self.columns.options]) for end in ENDS]
+        gain = self.evidence.looks(index, node.score.amounts, precision, *bounds)
         return {k: gain[list(self.columns.options[k].columns)].sum() for k in self.others(node)}
 
     def _looks(self, node):
@@ -242,18 +244,32 @@ def _by_windows(short, setting, inside, starts, rounds):
     """The Starts that gain most in the windows of a short Chain, beside those inside a setting."""
     columns = Columns(short, setting, inside + starts)
     beam = Beam(columns, columns.evidence())
-    node, kept = beam.node(beam.kept), {}
+    node, kept, index = beam.node(beam.kept), {}, {s: k for k, s in enumerate(columns.begun)}
+
+    def look(some):  # within the bounds of their amounts: columns tell of no values far from these
+        grown = beam.nodes_of([(*node.options, index[start]) for start in some])
+        return {start: node.unpriced - new.unpriced for start, new in zip(some, grown)}
+
     for _ in range(rounds):
-        others = beam.others(node)
-        # within the bounds of their amounts: a column tells of no values far from its own
-        grown = beam.nodes_of([(*node.options, k) for k in others])
-        gains = {columns.begun[k]: node.unpriced - new.unpriced for k, new in zip(others, grown)}
+        gains = {columns.begun[k]: g / beam.evidence.number for k, g in beam.gains(node).items()}
         if not gains:
             break
+        _renew(gains, kept, look)
         best, further = _best(gains, kept)
         kept |= dict.fromkeys(further)
-        node = beam.node((*node.options, columns.begun.index(best)))
+        node = beam.node((*node.options, index[best]))
     return list(kept)
+
+
+def _renew(gains, kept, look):
+    """Look in full at those of {Start: gain} that are the best, of a first look, until no other
+    one promises more."""
+    old = set(gains)
+    while old:
+        best, further = _best(gains, kept)
+        some = [start for start in dict.fromkeys((best, *further)) if start in old]
+        gains |= look(some)
+        old = old - set(some) if some else ()
 
 
 def explained(basis, target):

@@ -260,9 +260,9 @@ class Evidence:
         each = 1 / (np.maximum(self.count, 1) * (square + self.floor))
         return np.where(self.count > 0, each, 0.0)
 
-    def looks(self, columns, amounts, precision):
-        """In-sample gain (K,) in nats of each further column beside some at their amounts: a first
-        look."""
+    def looks(self, columns, amounts, precision, low, high):
+        """In-sample gain (K,) in nats of each further column, between bounds (K,) of its amount,
+        beside some at their amounts: a first look."""
         index, sums = np.concatenate([[0], np.asarray(columns, int) + 1]), self.sums
         square = self.squares(columns, np.asarray(amounts, float))
         weight = self.group.T @ self.weighed(square)  # (W, cells)
@@ -284,4 +284,5 @@ class Evidence:
             inside += 1e-9 * np.diag(np.diag(inside))  # of two columns that are the same
             curve -= (cross * np.linalg.solve(inside, cross.T).T).sum(1)
         seen = curve > 1e-9 * np.maximum(own, 1e-300)
-        return np.where(seen, score**2 / np.where(seen, curve, 1.0) / 2, 0.0)
+        amount = np.clip(score / np.where(seen, curve, np.inf), low, high)
+        return np.where(seen, amount * (score - amount * curve / 2), 0.0)

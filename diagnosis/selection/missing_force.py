@@ -76,7 +76,8 @@ class MissingForce:
 
     def basis(self, start):
         """(n, nv, p): what a Start holds of the force, each row as it is; None where no row
-        tells."""
+        tells. What acts at a joint or a drive is no force elsewhere: what a row with several
+        steps leaves there is small, but so may be what is usual there."""
         if self.chain.apart(start.candidate) or not len(self.rows):
             return None
         every = start.settings(self.plain)
@@ -86,7 +87,15 @@ class MissingForce:
                 self.done[key] = self.whole - self._pushed(setting)
         every = [self.done[key] for key in keys]
         moved = any(done.any() for done in every) and np.isfinite(every).all()
-        return np.stack(every, -1) * self.weight[..., None] if moved else None
+        weight = (self.weight * self._own(start.candidate.place))[..., None]
+        return np.stack(every, -1) * weight if moved else None
+
+    def _own(self, place):
+        """(nv,): in which dofs what acts at a place may be a force."""
+        model, joints = self.chain.model, self.chain.world.joints(place)
+        if place.kind not in ("joint", "actuator") or joints is None:
+            return np.ones(model.nv, bool)
+        return np.isin(model.dof_jntid, list(joints))
 
     def evidence(self, starts):
         """The Evidence of the force and of what Starts hold of it, all their directions in turn,

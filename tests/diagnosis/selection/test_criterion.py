@@ -232,7 +232,8 @@ def test_a_first_look_is_the_gain_of_least_squares(moves):
     columns, residual = clustered(rng, ahead, (4,)), clustered(rng, ahead)
     evidence = evidence_of(ahead, residual, columns)
     start = free(evidence, (1,))
-    gains = evidence.looks((1,), start.amounts, np.zeros(1))
+    far = np.full(4, 99.0)
+    gains = evidence.looks((1,), start.amounts, np.zeros(1), -far, far)
     weight = evidence.weighed(evidence.squares((1,), start.amounts))
     rows = np.sqrt(weight[ahead.group])[:, None, :] * np.ones(ahead.known.shape)
     if moves:
@@ -245,6 +246,16 @@ def test_a_first_look_is_the_gain_of_least_squares(moves):
     )
     for k in (0, 2, 3):
         assert gains[k] == pytest.approx((left([1]) - left([1, k])) / 2, rel=0.05, abs=1e-3)
+
+
+def test_a_first_look_promises_no_more_than_amounts_within_their_bounds():
+    rng, ahead = np.random.default_rng(6), scene()
+    columns = clustered(rng, ahead, (2,))
+    evidence = evidence_of(ahead, columns @ [1.0, 0.0] + 0.01 * clustered(rng, ahead), columns)
+    look = lambda low, high: evidence.looks((), [], [], *np.array([[low] * 2, [high] * 2]))[0]
+    most = look(-9.0, 9.0)
+    assert look(0.3, 3.0) == most and look(-9.0, 0.5) == pytest.approx(0.75 * most, rel=0.01)
+    assert look(-9.0, 0.0) == 0 > look(3.0, 9.0)
 
 
 def test_hypotheses_scored_together_are_those_scored_alone():

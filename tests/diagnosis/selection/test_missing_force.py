@@ -6,7 +6,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from plants import DRIVEN_PENDULUM, NOISE, recorded
+from plants import DRIVEN_PENDULUM, NOISE, commanded, recorded
 from scipy.ndimage import gaussian_filter1d
 
 from diagnosis.estimation.ahead import GROUPS, Ahead, cut_ahead
@@ -111,3 +111,33 @@ def test_what_an_effect_holds_is_worked_out_once_unless_a_setting_has_it(monkeyp
         assert np.median(abs(x - y)) < 0.02 * np.median(abs(y))  # but where friction sticks
     values = {plain[mass] for plain in asked if mass in plain}
     assert asked and not values
+
+
+TWO = """<mujoco><option timestep="0.002"/><worldbody><body><joint name="lift" type="slide"
+  axis="0 0 1" stiffness="300"/><geom size=".05" mass="1"/><body name="rod"><joint name="swing"
+  axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></body></body></worldbody></mujoco>"""
+
+
+def swung(seed, rows=300, dt=0.02):
+    """A run of it in stock MuJoCo, let go of somewhere."""
+    model, rng = mujoco.MjModel.from_xml_string(TWO), np.random.default_rng(seed)
+    data, qpos = mujoco.MjData(model), np.empty((rows, 2))
+    data.qpos[:] = rng.uniform(-1, 1, 2) * [0.05, 1.0]
+    for row in qpos:
+        row[:] = data.qpos
+        mujoco.mj_step(model, data, round(dt / model.opt.timestep))
+    noisy = qpos + NOISE * rng.normal(size=qpos.shape)
+    return replace(commanded(dt * np.arange(rows), joints=2), qpos=noisy)
+
+
+def test_what_acts_at_a_joint_is_no_force_in_another():
+    """Though a row of several steps leaves a little there, and little may be usual there."""
+    world, runs = World(mujoco.MjSpec.from_string(TWO)), [swung(0), swung(1)]
+    smoother = Smoother(world, runs)
+    chain = Chain(world, cut_ahead(runs), np.full(2, NOISE))
+    chain.start(smoother.locate({}))
+    missing, starts = MissingForce(chain, {}), Starts(world, {}, Usual(world, runs, smoother.scale))
+    held = lambda *what: missing.basis(starts.of([world.candidate(*what)])[0])
+    damping = held("viscous_damping", "swing")
+    assert damping[:, 1].any() and not damping[:, 0].any()
+    assert held("mass", "rod")[:, 0].any()
