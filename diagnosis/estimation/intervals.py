@@ -22,22 +22,16 @@ FEWEST = 4  # groups, below which their spread says nothing
 def intervals(fitted):
     """{candidate: [(low, high), ...]} of a Fitted set; None for a parameter that the recordings do
     not show."""
-    out, options = {}, fitted.columns.options
-    index = [i for o in options for i in o.columns]
-    middle, half = without_step(fitted, index)
-    at = 0
-    for c, values in fitted.setting.items():
-        out[c] = [None] * len(values)
-        option = next((o for o in options if o.candidate is c), None)
-        if option is None:
-            continue
-        for row in option.directions:
-            k = int(np.flatnonzero(row)[0])
-            ends = values[k] + row[k] * np.array([middle[at] - half[at], middle[at] + half[at], 0])
-            if np.isfinite(ends).all():
-                low, high = option.prior.low[k], option.prior.high[k]
-                out[c][k] = float(max(min(ends), low)), float(min(max(ends), high))
-            at += 1
+    out = {c: [None] * len(values) for c, values in fitted.setting.items()}
+    rows = [(o, row) for o in fitted.columns.options for row in o.directions]
+    index = [i for o in fitted.columns.options for i in o.columns]
+    for (option, row), at, wide in zip(rows, *without_step(fitted, index)):
+        k = int(np.flatnonzero(row)[0])
+        value, prior = fitted.setting[option.candidate][k], option.prior
+        ends = value + row[k] * np.array([at - wide, at + wide, 0])
+        if np.isfinite(ends).all():
+            bounds = float(max(min(ends), prior.low[k])), float(min(max(ends), prior.high[k]))
+            out[option.candidate][k] = bounds
     return out
 
 
@@ -48,9 +42,9 @@ def without_step(fitted, index):
     amount; where the recordings do not tell it from the others, it may be anything up to that.
     """
     columns, p = fitted.columns, len(index)
-    half, moves = half_widths(fitted.evidence, index)
     if not p:
-        return moves, half
+        return np.zeros(0), np.zeros(0)
+    half, moves = half_widths(fitted.evidence, index)
     change = columns.residual - columns.ahead.residual([fitted.setting], refine=2)[0]
     change = np.where(columns.lost, 0.0, change)
     stack = np.concatenate([columns.array[..., index], change[..., None]], -1)
@@ -72,9 +66,6 @@ def without_step(fitted, index):
 
 def half_widths(evidence, index):
     """Half widths and remaining Gauss-Newton moves (p,) of columns index (p,), amounts zero."""
-    p = len(index)
-    if not p:
-        return np.zeros(0), np.zeros(0)
     products, weight = _weighted(evidence, index)
     each = products.weighed(weight)
     scale = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], 1e-300))

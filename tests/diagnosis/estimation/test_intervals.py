@@ -1,11 +1,18 @@
 """Coverage of intervals under noise that is common to groups, for many parameters and for one."""
 
+import mujoco
 import numpy as np
 import pytest
 from interval_coverage import trial
+from plants import DRIVEN_PENDULUM, recorded
 from synthetic import clustered, evidence_of, free, scene
 
-from diagnosis.estimation.intervals import half_widths, one_number
+from diagnosis.estimation.ahead import Ahead, cut_ahead
+from diagnosis.estimation.intervals import half_widths, intervals, one_number
+from diagnosis.estimation.smoother import Smoother
+from diagnosis.selection.judge import Judge
+from diagnosis.selection.plausibility import Usual
+from diagnosis.simulation.simulator import World
 
 
 def fitted(ahead, residual, columns):
@@ -51,6 +58,25 @@ def test_intervals_hold_the_truth_of_a_world_with_finer_steps():
     assert sum(row["inside"] for row in rows) >= len(rows) - 1 and len(rows) >= 9
     width = [(float(r["high"]) - float(r["low"])) / float(r["truth"]) for r in rows]
     assert np.median(width) < 0.05
+
+
+def test_intervals_are_those_of_their_own_effects_in_whatever_order_a_set_was_found():
+    """Columns of a finer step come last, wherever a set has it."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.4)))
+    run = recorded("run.csv", 0, push=lambda t, q, v: -0.05 * np.tanh(v / 0.01))
+    smoother = Smoother(world, [run])
+    ahead = Ahead(world, cut_ahead([run]), smoother.position_noise)
+    ahead.start(smoother.locate({}))
+    begun = {"time_step": "world", "mass": "arm", "coulomb_friction": "pivot"}
+    values = dict(zip(begun, ((0.00125,), (0.5,), (0.05,))))
+    found = []
+    for order in (begun, reversed(begun)):
+        setting = {world.candidate(name, begun[name]): values[name] for name in order}
+        fitted = Judge(ahead, Usual(world, [run], smoother.scale)).fit(setting, steps=0)
+        found.append({c.effect.name: bounds[0] for c, bounds in intervals(fitted).items()})
+    assert found[0].keys() == found[1].keys()
+    for name, bounds in found[0].items():
+        assert bounds == pytest.approx(found[1][name], rel=1e-6), name
 
 
 def test_what_others_do_as_well_has_no_interval():
