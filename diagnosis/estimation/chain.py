@@ -87,23 +87,23 @@ class Chain(Ahead):
         ahead.start(self.trajectory, self.base)
         return ahead
 
-    def residual(self, settings, refine=1):
+    def residual(self, settings):
         """Measured less predicted, (settings, W, T, nv), as of Ahead."""
-        return self._predicted(settings, lambda contacts: contacts.residual(settings, refine))
+        return self._predicted(settings, Ahead.residual)
 
     def rough(self, settings):
         """As of Ahead."""
-        some = [with_own_step(setting) for setting in settings]
-        return self._predicted(some, lambda contacts: contacts.rough(some))
+        return self._predicted([with_own_step(s) for s in settings], Ahead.rough)
 
-    def _predicted(self, settings, simulated):
+    def _predicted(self, settings, simulate):
+        """simulate: the method of Ahead by which windows are simulated that are not carried on."""
         out = np.zeros((len(settings), *self.known.shape))
         if self.carried.any():
             plain = [self.plain(s) for s in settings]
             self._along(plain, out)
             self._beyond(settings, plain, out)
         if self.contacts:
-            rest = simulated(self.contacts)
+            rest = simulate(self.contacts, settings)
             out[:, self.touched] = 0.0
             out[:, self.touched, : rest.shape[2]] = rest
         return out
@@ -128,19 +128,17 @@ class Chain(Ahead):
         return out
 
     def telling(self):
-        """Rows in which located forces are compared, from now on along with every prediction."""
+        """Rows in which located forces are compared, from now on along with every prediction:
+        those whose force hangs by what happens in the rows used, evenly chosen."""
         if self.told is None:
-            self.told, self.lacks = self._told(), self.missing(self.base, self.used)
+            t = self.trajectory
+            outside = ~t.free
+            outside[self.begin] = False
+            beyond = t.response(t.driven * outside[:, None, None])
+            some = self.used[abs(beyond[self.used]).max((1, 2)) < OUTSIDE]
+            self.told = some[windowing.evenly(len(some), GROUPS * GROUPED)]
+            self.lacks = self.missing(self.base, self.used)
         return self.told
-
-    def _told(self):
-        """Rows whose located force hangs by what happens in the rows used, evenly chosen."""
-        t = self.trajectory
-        outside = ~t.free
-        outside[self.begin] = False
-        beyond = t.response(t.driven * outside[:, None, None])
-        some = self.used[abs(beyond[self.used]).max((1, 2)) < OUTSIDE]
-        return some[windowing.evenly(len(some), GROUPS * GROUPED)]
 
     def _along(self, settings, out):
         """Fill in what the chain predicts, the same once."""
@@ -191,9 +189,8 @@ class Chain(Ahead):
     def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""
         effect = candidate.effect
-        if candidate.when or effect.overrides("measure") or effect.numerical:
-            return True
-        return self.world.adds_states(candidate)
+        wide = candidate.when or effect.overrides("measure") or effect.numerical
+        return bool(wide) or self.world.adds_states(candidate)
 
     def plain(self, setting):
         """What of a setting happens within a row."""

@@ -22,8 +22,6 @@ from diagnosis.common.coordinates import (
 )
 from diagnosis.simulation.simulator import Window
 
-__all__ = ["channels", "difference", "integrate", "joint_name", "joint_slices", "states"]
-
 HORIZON = 0.3  # s, of the error that is reported
 ENDLESS = 1e100  # m or rad: whoever is farther off is nowhere
 DRAWS = 4  # of noise, for what a perfect simulator would miss
