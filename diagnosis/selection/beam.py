@@ -244,14 +244,15 @@ def _by_windows(short, setting, inside, starts, rounds):
     """The Starts that gain most in the windows of a short Chain, beside those inside a setting."""
     columns = Columns(short, setting, inside + starts)
     beam = Beam(columns, columns.evidence())
-    node, kept, index = beam.node(beam.kept), {}, {s: k for k, s in enumerate(columns.begun)}
+    starts = [o.start for o in columns.options]
+    node, kept, index = beam.node(beam.kept), {}, {s: k for k, s in enumerate(starts)}
 
     def look(some):  # within the bounds of their amounts: columns tell of no values far from these
         grown = beam.nodes_of([(*node.options, index[start]) for start in some])
         return {start: node.unpriced - new.unpriced for start, new in zip(some, grown)}
 
     for _ in range(rounds):
-        gains = {columns.begun[k]: g / beam.evidence.number for k, g in beam.gains(node).items()}
+        gains = {starts[k]: g / beam.evidence.number for k, g in beam.gains(node).items()}
         if not gains:
             break
         _renew(gains, kept, look)

@@ -139,9 +139,16 @@ class Starts:
             most = effect.limit([world.model], i, np.array([values], float))
             return -t.direction()[rows] * most(t.qpos[rows], t.qvel[rows], None, None, None)
         structure = [candidate] if effect.overrides("build") else []
-        engine = world.engine(frozenset(structure)).working
-        model = engine.edited([(candidate, tuple(values))], world.model.opt.timestep)
-        return applied(model, t.qpos[rows], t.qvel[rows], engine)
+        working = world.engine(frozenset(structure)).working
+        model = working.edited([(candidate, tuple(values))], world.model.opt.timestep)
+        data, out = mujoco.MjData(model), np.empty((len(rows), world.model.nv))
+        for row, q, v in zip(out, t.qpos[rows], t.qvel[rows]):
+            data.qpos[working.q], data.qvel[working.v] = q, v  # in the nominal coordinates
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            mujoco.mj_fwdActuation(model, data)
+            row[:] = (data.qfrc_actuator + data.qfrc_passive)[working.v]
+        return out
 
 
 def _full(candidate, base, rows, prior):
@@ -210,24 +217,12 @@ def _reach(base, directions, prior):
     return ends.min(0).max(1), ends.max(0).min(1)
 
 
-def applied(model, qpos, qvel, working):
-    """Generalized forces of actuators and joints (n, nv) at states (n, nq), (n, nv) of the nominal
-    coordinates."""
-    data, out = mujoco.MjData(model), np.empty((len(qpos), qvel.shape[1]))
-    for row, q, v in zip(out, qpos, qvel):
-        data.qpos[working.q], data.qvel[working.v] = q, v
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        mujoco.mj_fwdActuation(model, data)
-        row[:] = (data.qfrc_actuator + data.qfrc_passive)[working.v]
-    return out
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Option(Start):
-    """A Start and its columns: their indices (p,)."""
+    """What of a Start shows, and its columns: their indices (p,)."""
 
     columns: tuple
+    start: Start = None
 
     def values(self, amounts):
         """The candidate's values at amounts (p,)."""
@@ -258,12 +253,6 @@ class Option(Start):
         return precision, pull
 
 
-def stepwise(world, candidate):
-    """Whether a candidate has to be worked out before each step, which is dear."""
-    effect = candidate.effect
-    return effect.stepwise(world.model, effect.id(world.model, candidate.place.name))
-
-
 class Columns:
     """Simulates the columns of starts about a setting. residual (W, T, nv); array (W, T, nv, K);
     options."""
@@ -272,12 +261,12 @@ class Columns:
         """residual: of the setting, if it is known; seen: {candidate: which of its parameters
         show}, kept up to date; known: other Columns, whose effects' are taken as if they were the
         same here."""
-        self.ahead, self.setting, self.world = ahead, setting, ahead.world
+        self.ahead, self.setting = ahead, setting
         self.options, self.simulated = [], int(residual is None)
         self.seen = {} if seen is None else seen
         self.residual = ahead.residual([setting])[0] if residual is None else residual
         self.lost = abs(self.residual) >= ahead.travel  # rows of which no slope tells anything
-        self.parts, self.begun = [], []  # the Start of every option
+        self.parts = []  # [(W, T, nv)]
         if known:
             self._take(known)
         mine = {option.candidate for option in self.options}
@@ -285,13 +274,12 @@ class Columns:
 
     def _take(self, known):
         """The columns that others have of the setting's effects."""
-        for option, begun in zip(known.options, known.begun):
+        for option in known.options:
             if option.candidate in self.setting:
                 first, old = len(self.parts), option.columns
                 self.parts += [known.parts[i] for i in old]
                 option = option.about(self.setting[option.candidate])
                 self.options.append(replace(option, columns=(*range(first, first + len(old)),)))
-                self.begun.append(begun)
 
     def about(self, setting, residual):
         """These Columns about other values of the setting's effects, whose residual is known."""
@@ -311,10 +299,12 @@ class Columns:
 
     def _simulate(self, starts):
         """Simulate starts; those that change nothing are left out."""
-        numerical = lambda start: start.candidate.effect.numerical
-        physics = [start for start in starts if not numerical(start)]
-        physics = sorted(physics, key=lambda start: stepwise(self.world, start.candidate))
-        steps, ahead = [*filter(numerical, starts)], self.ahead
+        ahead, model = self.ahead, self.ahead.model
+        place = lambda c: c.effect.id(model, c.place.name)
+        # last what has to be worked out before each step, which is dear
+        dear = lambda start: start.candidate.effect.stepwise(model, place(start.candidate))
+        physics = sorted((s for s in starts if not s.candidate.effect.numerical), key=dear)
+        steps = [start for start in starts if start.candidate.effect.numerical]
         rough = self.residual
         if physics and not ahead.same(self.setting):
             rough = ahead.rough([self.setting])[0]
@@ -329,8 +319,7 @@ class Columns:
             columns = tuple(range(len(self.parts), len(self.parts) + seen.sum()))
             self.parts += [c for c, yes in zip(own, seen) if yes]
             shown = {f: getattr(start, f)[seen] for f in ("directions", "low", "high")}
-            self.options.append(Option(**vars(start) | shown, columns=columns))
-            self.begun.append(start)
+            self.options.append(Option(**vars(start) | shown, columns=columns, start=start))
 
     def _changes(self, residual, base, starts):
         """[(W, T, nv)] of all directions of starts: base, less the residual with them."""
