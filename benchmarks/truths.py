@@ -53,8 +53,7 @@ def judged(folder):
     if not truth:
         return None
     search = Identification(given.world, given.train)
-    search.begin(truth, search.locate(truth)[0])
-    judge = search.judge()
+    judge = search.begin(truth, search.locate(truth)[0])
     nominal, true = judge.fit({}), judge.fit(truth, steps=0)
     fitted = search.finer(judge, judge.fit(truth, steps=3))
     shares, most = share_left(fitted), max(lacking(fitted), key=lambda c: c.gain)

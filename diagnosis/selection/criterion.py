@@ -81,9 +81,10 @@ class Evidence:
     state is free within what the smoother knows of it: under every hypothesis the likeliest one,
     given the errors that this leaves."""
 
-    def __init__(self, ahead, residual, columns, reference=None):
-        """reference (G, cells): mean squared errors of what others are compared with; None takes
-        this residual's."""
+    def __init__(self, ahead, residual, columns=None, reference=None):
+        """columns: none by default; reference (G, cells): mean squared errors of what others are
+        compared with; None takes this residual's."""
+        columns = np.zeros((*residual.shape, 0)) if columns is None else columns
         groups, bands = ahead.group.max() + 1, range(ahead.band.max() + 1)
         cells = [(dofs, b) for dofs in ahead.channels for b in bands]
         stack = np.concatenate([residual[..., None], columns, ahead.freedom()], -1)

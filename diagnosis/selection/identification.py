@@ -54,8 +54,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen, self.missing, self.sets = {}, None, []
-        self.ranking = []
+        self.seen, self.missing, self.sets, self.ranking = {}, None, [], []
         self.looked = 1.0  # how many different columns a round looks at
         apart = lambda c: c.place.kind == "sensor" or c.effect.timed or c.effect.numerical
         self.candidates = [c for c in world.candidates if not apart(c)]
@@ -65,17 +64,15 @@ class Identification:
         setting = setting or {}
         trajectory, first = self.locate(setting)
         for i in range(ROUNDS):
-            self.begin(setting, trajectory)
+            judge = self.begin(setting, trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
-            judge = self.judge()
-            fitted, better = self._round(setting, judge)
-            if not better:
+            fitted = self._round(setting, judge)
+            if fitted.setting.keys() == setting.keys():
                 break
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory, passes=1)
         else:  # rounds ended with a set from which nothing has begun
-            self.begin(setting, trajectory)
-            judge = self.judge()
+            judge = self.begin(setting, trajectory)
             self.missing = MissingForce(self.screen, setting, self.missing)
             fitted = judge.fit(setting)
             self.sets = carried(judge, self.sets, fitted, fitted)
@@ -97,15 +94,12 @@ class Identification:
         return trajectory, first
 
     def begin(self, setting, trajectory):
-        """Windows that begin at a trajectory located under a setting."""
+        """The Judge of windows that begin at a trajectory located under a setting. It compares with
+        the nominal model: an effect has to remove something of what that misses."""
         self.ahead, self.screen = (copy(windows) for windows in self.windows)
         self.ahead.start(trajectory, setting)
         self.screen.start(trajectory, setting)
         self.trajectory = trajectory
-
-    def judge(self):
-        """A Judge that compares with the nominal model: an effect has to remove something of what
-        that misses."""
         return Judge(self.ahead, self.usual, squares(self.ahead), self.seen)
 
     def begun(self, judge, setting):
@@ -115,7 +109,7 @@ class Identification:
         return Judge(ahead, self.usual, judge.reference, self.seen)
 
     def _round(self, setting, judge):
-        """(Fitted, whether it holds other effects than there were)."""
+        """The Fitted set that a round ends with."""
         others = [c for c in self.candidates if c not in setting]
         every, curves = [*setting, *others], self._curves(setting)
         known = self.usual, self.seen, self.trajectory, self.screen.touches
@@ -133,8 +127,7 @@ class Identification:
         self.ranking = self.ranking or beam.ranking()  # of the first look of all
         judged = self._judged(judge, beam, now)
         best = self._ended(judge, self._choose(judged, now), now)
-        best = self._beside(judge, judged, now, best)
-        return best, best.setting.keys() != setting.keys()
+        return self._beside(judge, judged, now, best)
 
     def _judged(self, judge, beam, now):
         """[Fitted] of what there was and of the sets that a beam finds. What ends at a bound of the
@@ -300,7 +293,7 @@ def squares(ahead, residual=None):
     """Mean squared errors (groups, cells) of an Ahead's residual (W, T, nv), by default that of the
     nominal model."""
     residual = ahead.residual([{}])[0] if residual is None else residual
-    return Evidence(ahead, residual, np.zeros((*residual.shape, 0))).reference
+    return Evidence(ahead, residual).reference
 
 
 def said(setting):

@@ -101,8 +101,8 @@ class Judge:
             moved = moved_setting(columns, amounts / 3**third)
             if np.isfinite(self.cost(moved)):
                 residual = self.ahead.residual([moved])[0]
-                bare = Evidence(self.ahead, residual, np.zeros((*residual.shape, 0)))
-                gained = now - bare.plain() - self.cost(moved) / each
+                bare = Evidence(self.ahead, residual).plain()
+                gained = now - bare - self.cost(moved) / each
                 if gained > most:
                     best, most = (moved, residual), gained
                     as_told = abs(gained - told) < TRUE * told
@@ -206,4 +206,4 @@ def _perfect(fitted):
     for dofs, times in zip(ahead.channels, mean / np.maximum(noise**2, 1e-300)):
         louder[dofs] = np.sqrt(max(times, 1.0))
     drawn = ahead.drawn(fitted.setting, fitted.columns.residual, louder, rng)
-    return Evidence(ahead, drawn, np.zeros((*drawn.shape, 0)), evidence.reference)
+    return Evidence(ahead, drawn, reference=evidence.reference)

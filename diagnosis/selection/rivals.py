@@ -156,12 +156,14 @@ def _tied(tried, fitted):
 
 
 def _alike(judge, missing, candidate, pool, held):
-    """[(other, values)] that predict about as well in the candidate's place as far as columns at
-    the model without it tell, the best first, and of those that are as good the simplest. held:
-    Columns of the set, which stand for those without the candidate."""
-    chain, rest = missing.chain, missing.setting
-    near = _near(chain.world, candidate, pool) + list(rest)
-    starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory).of(near)
+    """[(other, values)] of a pool that act where the candidate does, or everywhere, and predict
+    about as well in its place as far as columns at the model without it tell, the best first, and
+    of those that are as good the simplest. held: Columns of the set, which stand for those without
+    the candidate."""
+    chain, rest, units = missing.chain, missing.setting, complexity([candidate]) + FURTHER
+    near = [c for c in pool if complexity([c]) <= units and meet(chain.world, c, candidate)]
+    starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory)
+    starts = starts.of([*near, *rest])
     columns = Columns(chain, rest, likely(missing, starts), known=held)
     options, evidence = columns.options, columns.evidence(judge.reference)
     kept = [k for k, o in enumerate(options) if o.candidate in rest]
@@ -178,12 +180,6 @@ def _alike(judge, missing, candidate, pool, held):
     tied = min((loss for loss, _ in out.values()), default=0.0) + TIED
     order = lambda c: (max(out[c][0], tied), complexity([c]), out[c][0])
     return [(c, out[c][1]) for c in sorted(out, key=order)]
-
-
-def _near(world, candidate, pool):
-    """Candidates of a pool that act where a finding does, or everywhere."""
-    most = complexity([candidate]) + FURTHER
-    return [c for c in pool if complexity([c]) <= most and meet(world, c, candidate)]
 
 
 def meet(world, candidate, other):

@@ -272,13 +272,12 @@ def test_a_stop_on_a_side_where_none_is_met_is_no_finding(search, shown, left):
 def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
     best, asked = fitted(search, ["armature"], -1.0), []
     monkeypatch.setattr(search, "begin", lambda *given: None)
-    monkeypatch.setattr(search, "judge", lambda: None)
     monkeypatch.setattr(search, "locate", lambda setting: ("located", "first"))
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
 
     def round_of(setting, judge):
         asked.append(setting)
-        return best, len(asked) < 2
+        return best
 
     monkeypatch.setattr(search, "_round", round_of)
     found = search.run()

@@ -158,7 +158,7 @@ def test_a_step_is_taken_as_far_as_it_lowers_the_loss(monkeypatch, told, losses,
         residual=lambda settings: asked.extend(settings) or np.array(settings)
     )
     judge.cost = lambda share: 0.0
-    bare = lambda ahead, residual, columns: SimpleNamespace(plain=lambda: shares[float(residual)])
+    bare = lambda ahead, residual: SimpleNamespace(plain=lambda: shares[float(residual)])
     monkeypatch.setattr("diagnosis.selection.judge.Evidence", bare)
     monkeypatch.setattr("diagnosis.selection.judge.moved_setting", lambda columns, share: share)
     evidence = SimpleNamespace(plain=lambda *by: -told if by else 0.0, cells=1, count=[0])

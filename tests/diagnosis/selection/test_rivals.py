@@ -50,7 +50,6 @@ def chosen(monkeypatch, fitted, losses, sensors=(), asked=None):
     chain = SimpleNamespace(world=world, apart=lambda c: c.name in sensors)
     lacks = [Score(size, np.full(4, size), np.full(4, 4 * size), ()) for size in (1.0, 0.0)]
     silent = SimpleNamespace(scores=lambda *settings: lacks if sensors else None, chain=chain)
-    monkeypatch.setattr(rivals, "_near", lambda *args: [])
     held = SimpleNamespace(setting=None)
     monkeypatch.setattr(rivals, "_along", lambda *args: held)
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
@@ -191,8 +190,7 @@ def test_another_effect_is_begun_at_the_value_that_it_takes_not_near_its_starts(
     damping = world.candidate("viscous_damping", "pivot")
     back_emf = world.candidate("back_emf", "drive")
     search = Identification(world, runs)
-    search.begin({}, search.locate({})[0])
-    judge = search.judge()
+    judge = search.begin({}, search.locate({})[0])
     fitted = judge.fit({damping: (0.01 + more,)})
     missing = MissingForce(search.screen, {})
     held = rivals._along(search.screen, judge, fitted.setting)
