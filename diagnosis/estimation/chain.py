@@ -129,14 +129,15 @@ class Chain(Ahead):
 
     def telling(self):
         """Rows in which located forces are compared, from now on along with every prediction:
-        those whose force hangs by what happens in the rows used, evenly chosen."""
+        those whose force hangs by what happens in the rows used, as many in each group."""
         if self.told is None:
             t = self.trajectory
             outside = ~t.free
             outside[self.begin] = False
             beyond = t.response(t.driven * outside[:, None, None])
             some = self.used[abs(beyond[self.used]).max((1, 2)) < OUTSIDE]
-            self.told = some[windowing.evenly(len(some), GROUPS * GROUPED)]
+            some = some[windowing.evenly(len(some), GROUPS * GROUPED)]
+            self.told = some[: len(some) // GROUPS * GROUPS]
             self.lacks = self.missing(self.base, self.used)
         return self.told
 
@@ -161,13 +162,13 @@ class Chain(Ahead):
         self.located |= dict(zip(every, np.moveaxis(force, -1, 0)))
 
     def lacking(self, settings):
-        """[(rows, nv)]: generalized force that plain settings lack in the rows told, as the
+        """(rows, nv, settings): generalized force that settings lack in the rows that tell, as the
         smoother locates it."""
-        self.telling()
-        keys = [frozenset(setting.items()) for setting in settings]
-        new = {key: s for key, s in zip(keys, settings) if key not in self.located}
-        self._locate({key: self.missing(s, self.used) for key, s in new.items()})
-        return [self.located[key] for key in keys]
+        plain = [self.plain(setting) for setting in settings]
+        keys = [frozenset(setting.items()) for setting in plain]
+        new = {key: p for key, p in zip(keys, plain) if key not in self.located}
+        self._locate({key: self.missing(p, self.used) for key, p in new.items()})
+        return np.stack([self.located[key] for key in keys], -1)
 
     def _beyond(self, settings, plain, out):
         """Add what effects do that are more than what happens within a row, beside the setting that

@@ -46,10 +46,9 @@ class MissingForce:
         """before: a MissingForce in the same rows, from which what effects do there that neither
         setting has is taken over: a motion that is located anew hardly moves."""
         self.chain, self.setting = chain, setting
-        self.rows = chain.telling()[: len(chain.telling()) // GROUPS * GROUPS]
+        self.rows, self.done = chain.telling(), {}
         self.seen, self.plain = np.isfinite(chain.noise), chain.plain(setting)
-        self.force, self.noise = self._lacking([setting])[..., 0], np.full(chain.model.nv, np.inf)
-        self.done = {}
+        self.force, self.noise = chain.lacking([setting])[..., 0], np.full(chain.model.nv, np.inf)
         if before and np.array_equal(before.rows, self.rows):
             known, inside = before.done.items(), {*setting, *before.setting}
             self.done = {key: done for key, done in known if key[0] not in inside}
@@ -62,12 +61,6 @@ class MissingForce:
             # a joint that sticks obeys no force
             self.obeyed = np.linalg.pinv(chain.trajectory.driven[self.rows, chain.model.nv :])
             self.whole = self._pushed(self.plain)
-
-    def _lacking(self, settings):
-        """Generalized force (n, nv, settings) that settings lack in the rows, as the smoother
-        locates it."""
-        found = self.chain.lacking([self.chain.plain(setting) for setting in settings])
-        return np.stack(found, -1)[: len(self.rows)]
 
     def _pushed(self, plain):
         """Generalized force (n, nv) that a plain setting lacks in each row, as it is."""
@@ -107,7 +100,7 @@ class MissingForce:
 
     def _held(self, settings):
         """(n, nv, settings): what each of them holds of the force."""
-        return self.force[..., None] - self._lacking(settings) * self.weight[..., None]
+        return self.force[..., None] - self.chain.lacking(settings) * self.weight[..., None]
 
     def _evidence(self, held):
         """Of the force and what is held of it, [(n, nv, p)]."""

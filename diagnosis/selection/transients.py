@@ -2,7 +2,7 @@
 
 event = find(world, recordings, setting, trajectory, noise)   # None, or an Event
 event.candidate, event.values                                 # a localised Candidate
-event.when                                                    # {"recording": name, "time": [a, b]}
+event.candidate.when                                          # {"recording": name, "time": [a, b]}
 
 The gain of an effect that acts in short windows a..b only is that of the sums of its scores and
 Gram matrices over them, so every interval is tested from one simulation per effect. Windows begin
@@ -215,10 +215,9 @@ class Windows:
         self.rough = self.residual if same else self._raw(world.quick, [setting])[0]
         moved = (self._raw(world.quick, [setting], step)[0] for step in np.diag(small))
         slopes = [(rough - self.rough) / eps for eps, rough in zip(small, moved)]
-        self.known = self.residual != 0
         # of each window its own basis: orthonormal columns (W, rows, 2 nv)
         self.basis = np.linalg.qr(np.stack(slopes, -1))[0]
-        self.rows = np.maximum(self.known.sum(1) - self.basis.shape[-1], 1)
+        self.rows = np.maximum((self.residual != 0).sum(1) - self.basis.shape[-1], 1)
         self.plain = self._beside(self.residual[None])[0]
 
     def _raw(self, world, settings, moved=None):
