@@ -22,12 +22,12 @@ GROUPS = 16  # of neighbouring windows, the units that are left out and compared
 FREE = 1.0  # share of what the smoother leaves open of a start state, that a prediction may use
 
 
-def cut_ahead(recordings, longest=HORIZONS[-1]):
+def cut_ahead(recordings):
     """Windows end to end, as long as the longest horizon, or shorter where that gave fewer than
     FEWEST."""
     seconds = [r.time[-1] - r.time[r.start] for r in recordings]
     sample = windowing.sampling(recordings)
-    longest = max(min(longest, sum(seconds) / FEWEST), LEAST * sample)
+    longest = max(min(HORIZONS[-1], sum(seconds) / FEWEST), LEAST * sample)
     windows = windowing.cut(recordings, longest)
     return [windows[i] for i in windowing.evenly(len(windows), MOST)]
 
@@ -58,9 +58,9 @@ class Ahead:
         time = windowing.measured(windows, lambda recording: recording.time)
         self.seconds = time - time[:, :1]
         ends = np.nanmax(self.seconds) * np.array(HORIZONS) / HORIZONS[-1] * (1 + 1e-6)
-        self.band = np.where(np.isnan(self.seconds), -1, np.searchsorted(ends, self.seconds))
+        self.band = np.searchsorted(ends, self.seconds)
+        self.band[self.band == len(ends)] = -1  # of no row: NaN is beyond all ends
         self.band[:, 0] = -1
-        self.band[self.band >= len(ends)] = -1
         self.group = neighbours(len(windows))
         self.channels = list(windowing.channels(self.model).values())
         self.noise, self.step = noise, self.model.opt.timestep

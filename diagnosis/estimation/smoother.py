@@ -188,9 +188,9 @@ class Smoother:
         args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
         return Trajectory(*args, Response(found.gains, self.index, self.own))
 
-    def _linear(self, rows, qpos, qvel, force, free, like=None):
-        """(A, c, extra) of every row that has a next one: transitions of (q, v, w) about a
-        trajectory, or of another one like it; extra velocity variance."""
+    def _linear(self, rows, qpos, qvel, force, free, like):
+        """(A, c, extra, seconds) of every row that has a next one: transitions of (q, v, w) about a
+        trajectory, or of another one like it, if not None; extra velocity variance; its length."""
         model, nv = self.model, self.model.nv
         now = ~self.last
         if like is None:

@@ -205,7 +205,7 @@ class Windows:
     """
 
     def __init__(self, world, setting, windows, trajectory, noise):
-        """trajectory: a smoother.Trajectory under the setting; noise (nv,): of the positions."""
+        """trajectory: under the setting; noise (nv,): of the positions."""
         self.world, self.setting, self.windows = world, setting, windows
         self.qpos, self.qvel = trajectory.at(windows)
         self.measured, self.noise = windowing.measured(windows), noise
