@@ -253,7 +253,7 @@ class Identification:
     def pruned(self, judge, fitted, now):
         """Without the effects that do not earn their place beside the others, as long as what stays
         is earned over what there was: together effects may be earned of which none is. Those that
-        small changes show to be needed are not tried without."""
+        small changes show to be needed are not tried without, but for the one missed least."""
         whole = fitted
         while len(fitted.setting) > 1:
             rest = lambda out: {c: v for c, v in fitted.setting.items() if c is not out}
@@ -271,10 +271,11 @@ class Identification:
 
     def _missed_least(self, fitted):
         """Effects of a set that may not earn their place: up to TRIED, and limits, of which small
-        changes tell nothing."""
+        changes tell nothing. The one that is missed least in any case: near the noise columns are
+        too rough to show that two which share one thing need each other."""
         left = {c: without(fitted, c) for c in fitted.setting}
-        some = [c for c in left if not self.earned(left[c], fitted)]
-        some.sort(key=lambda c: left[c].loss)
+        order = sorted(left, key=lambda c: left[c].loss)
+        some = [c for c in order if not self.earned(left[c], fitted)] or order[:1]
         limits = sum(np.isinf(left[c].loss) for c in some)
         return some[: limits + TRIED]
 

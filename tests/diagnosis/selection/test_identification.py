@@ -320,3 +320,18 @@ def test_beside_limits_that_small_changes_do_not_tell_of_the_others_are_tried_to
     assert search._missed_least(whole) == [*limits, *others[:2]]
     losses[others[1]] = -0.7  # it is needed, as the last one is
     assert search._missed_least(whole) == [*limits, others[0]]
+
+
+def test_what_is_missed_least_is_tried_without_though_small_changes_show_it_to_be_needed(
+    search, monkeypatch
+):
+    """A delay and a lag that share one lateness: columns say that the lag is needed, a refit
+    without it is as good."""
+    names = "armature", "stiffness", "viscous_damping"
+    others = [search.world.candidate(name, "elbow") for name in names]
+    losses = dict(zip(others, (-0.7, -0.9, -0.8)))
+    whole = SimpleNamespace(setting=dict.fromkeys(others, ()), loss=-1.0)
+    left = lambda fitted, c: SimpleNamespace(loss=losses[c])
+    monkeypatch.setattr(identification, "without", left)
+    monkeypatch.setattr(search, "earned", lambda before, after: True)
+    assert search._missed_least(whole) == [others[1]]
