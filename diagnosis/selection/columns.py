@@ -367,3 +367,30 @@ class Columns:
             bounds = np.array([low]), np.array([high])
             starts.append(Start(o.candidate, o.base, row[None], *bounds, o.prior))
         self._simulate(starts)
+
+    def nearer(self, reference, starts):
+        """Whole values of which no share means anything again, between the best of those tried and
+        its neighbours among starts, as waves are moved: the criterion cannot move these, and a tone
+        between two that are tried is out of step within a second."""
+        fixed = lambda s: (s.low >= s.high).all() and (s.base + s.directions[0] > 0).all()
+        some = {o.candidate for o in self.options if fixed(o) and o.candidate not in self.setting}
+        for candidate in sorted(some, key=str):
+            line = [s for s in starts if s.candidate is candidate and fixed(s)]
+            of = lambda start: start.base + start.directions[0]
+            best = self._best_of(candidate, reference)
+            at = int(np.argmin([abs(np.log(of(s) / of(best))).sum() for s in line]))
+            ends = [line[i] for i in (at - 1, at + 1) if 0 <= i < len(line)]
+            steps = [np.log(of(end) / of(line[at])) for end in ends]
+            for share in NEARER:
+                rows = [of(best) * np.exp(share * step) for step in steps]
+                rows = [row for row in rows if best.prior.inside(row)]
+                new = [replace(line[at], directions=(row - best.base)[None]) for row in rows]
+                self._simulate(new)
+                best = self._best_of(candidate, reference)
+
+    def _best_of(self, candidate, reference):
+        """The Option of a candidate that leaves least."""
+        mine = [o for o in self.options if o.candidate is candidate]
+        given = [(o.columns, o.low, o.high, *o.quadratic()) for o in mine]
+        scores = self.evidence(reference).scores(given)
+        return mine[int(np.argmin([score.loss for score in scores]))]

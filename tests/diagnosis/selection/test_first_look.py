@@ -10,9 +10,10 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 from diagnosis.estimation.ahead import cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
+from diagnosis.recordings.recording import Recording
 from diagnosis.selection import beam
 from diagnosis.selection.beam import likely
-from diagnosis.selection.columns import Start, Starts
+from diagnosis.selection.columns import Columns, Start, Starts
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.simulator import World
@@ -172,3 +173,47 @@ def test_beginnings_simulate_an_effect_once_for_all_starts(scene, monkeypatch):
     monkeypatch.setattr(short.whole, "residual", asked.append)
     np.testing.assert_array_equal(short.residual([late])[0] - nominal, first - nominal)
     assert not asked
+
+
+DISC = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
+<joint name="shaft" type="hinge" axis="0 0 1" armature="0.0024" damping="0.003"/>
+<inertial pos="0 0 0" mass="1" diaginertia="0.001 0.001 0.0019"/></body></worldbody>
+<actuator><motor name="drive" joint="shaft"/></actuator></mujoco>"""
+
+
+def two_discs(name, seed, stiffness, damping, step=2e-4, every=25):
+    """A Recording of a disc that turns another one by a spring, at 200 Hz for 6 s."""
+    rng, rows = np.random.default_rng(seed), 1200
+    tones, phases = rng.uniform(0.2, 4.0, 9), rng.uniform(0, 2 * np.pi, 9)
+    time = np.arange(rows) * step * every
+    torque = 0.05 * np.sin(2 * np.pi * tones * time[:, None] + phases).sum(1)
+    angle, (q, v, p, w) = np.empty(rows), np.zeros(4)
+    for row in range(rows):
+        angle[row], torque[row] = q, torque[row] - 0.03 * q
+        for _ in range(every):
+            spring = stiffness * (q - p) + damping * (v - w)
+            v += step * (torque[row] - spring - 0.003 * v) / 0.0024
+            w += step * spring / 0.0019
+            q, p = q + step * v, p + step * w
+    qpos = (angle + 4e-4 * rng.normal(size=rows))[:, None]
+    return Recording(name, time, qpos, np.full_like(qpos, np.nan), torque[:, None])
+
+
+def test_a_tone_between_two_that_are_tried_is_moved_to():
+    """The nearest tone tried is 11 % too fast: of no use a second ahead, and an elastic joint alone
+    was never judged."""
+    stiffness = 0.5424
+    world = World(mujoco.MjSpec.from_string(DISC))
+    runs = [two_discs(f"{k}.csv", k, stiffness, 0.0014) for k in (0, 1)]
+    smoother = Smoother(world, runs)
+    chain = Chain(world, cut_ahead(runs), np.array([4e-4]))
+    chain.start(smoother.locate({}))
+    usual = Usual(world, runs, smoother.scale)
+    every = Starts(world, {}, usual).of([world.candidate("joint_elasticity", "shaft")])
+    columns = Columns(chain, {}, likely(MissingForce(chain, {}), every))
+    off = lambda: min(abs((o.base + o.directions[0])[0] / stiffness - 1) for o in columns.options)
+    assert off() > 0.2
+    columns.nearer(None, every)
+    best = columns._best_of(every[0].candidate, None)
+    assert abs((best.base + best.directions[0])[0] / stiffness - 1) < 0.1
