@@ -15,6 +15,7 @@ import numpy as np
 
 from diagnosis.recordings.columns import WIDTHS
 from diagnosis.recordings.plausibility import grouped
+from diagnosis.recordings.quality import encoder_quantum
 
 AWAY = 8  # a spike is so many times as far off as rows usually are,
 PACE = 3  # and as the motion before and after goes in a row
@@ -112,7 +113,9 @@ def _repeats(values):
     same = change == 0
     if same.all() or not same.any():
         return found
-    count = change[~same].min()
+    # readings that were interpolated rest at an encoder's steps, and move on by parts of one
+    rests = values[rows[1:]][same]
+    count = max(change[~same].min(), *map(encoder_quantum, rests.T))
     chance = same.sum() <= 3 * (
         np.count_nonzero(change[~same] < 1.5 * count) - 1
     )  # a coarse and noisy sensor repeats, too

@@ -373,24 +373,23 @@ class Columns:
         its neighbours among starts, as waves are moved: the criterion cannot move these, and a tone
         between two that are tried is out of step within a second."""
         fixed = lambda s: (s.low >= s.high).all() and (s.base + s.directions[0] > 0).all()
-        some = {o.candidate for o in self.options if fixed(o) and o.candidate not in self.setting}
-        for candidate in sorted(some, key=str):
+        of = lambda start: start.base + start.directions[0]
+        some = [o.candidate for o in self.options if fixed(o) and o.candidate not in self.setting]
+        for candidate in dict.fromkeys(some):
             line = [s for s in starts if s.candidate is candidate and fixed(s)]
-            of = lambda start: start.base + start.directions[0]
             best = self._best_of(candidate, reference)
             at = int(np.argmin([abs(np.log(of(s) / of(best))).sum() for s in line]))
-            ends = [line[i] for i in (at - 1, at + 1) if 0 <= i < len(line)]
-            steps = [np.log(of(end) / of(line[at])) for end in ends]
+            steps = [np.log(of(s) / of(line[at])) for s in line[max(at - 1, 0) : at + 2]]
             for share in NEARER:
-                rows = [of(best) * np.exp(share * step) for step in steps]
-                rows = [row for row in rows if best.prior.inside(row)]
-                new = [replace(line[at], directions=(row - best.base)[None]) for row in rows]
-                self._simulate(new)
+                rows = [of(best) * np.exp(share * step) for step in steps if step.any()]
+                rows = [row - best.base for row in rows if best.prior.inside(row)]
+                self._simulate([replace(line[at], directions=row[None]) for row in rows])
                 best = self._best_of(candidate, reference)
 
     def _best_of(self, candidate, reference):
-        """The Option of a candidate that leaves least."""
-        mine = [o for o in self.options if o.candidate is candidate]
-        given = [(o.columns, o.low, o.high, *o.quadratic()) for o in mine]
-        scores = self.evidence(reference).scores(given)
+        """The Option of one column of a candidate that leaves least."""
+        mine = [o for o in self.options if o.candidate is candidate and len(o.columns) == 1]
+        columns = np.stack([self.parts[o.columns[0]] for o in mine], -1)
+        given = [((k,), o.low, o.high, *o.quadratic()) for k, o in enumerate(mine)]
+        scores = Evidence(self.ahead, self.residual, columns, reference).scores(given)
         return mine[int(np.argmin([score.loss for score in scores]))]

@@ -115,13 +115,13 @@ class Identification:
         known = self.usual, self.seen, self.trajectory, self.screen.touches
         starts = Starts(self.world, setting, *known)
         self.missing = missing = MissingForce(self.screen, setting, self.missing)
-        starts_of = starts.of(every)
-        some = likely(missing, starts_of)
+        tried = starts.of(every)
+        some = likely(missing, tried)
         some += [starts.curve(*curve) for curve in curves]
         columns = Columns(self.screen, setting, some, seen=self.seen)
         nominal = squares(self.screen, columns.residual if not setting else None)
         columns.secants(columns.evidence(nominal))
-        columns.nearer(nominal, starts_of)
+        columns.nearer(nominal, tried)
         evidence = columns.evidence(nominal)
         self.looked = max(evidence.different(), 1.0)
         beam, now = Beam(columns, evidence, missing), judge.fit(setting)

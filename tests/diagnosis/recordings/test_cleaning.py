@@ -48,6 +48,16 @@ def test_readings_that_are_alike_by_chance_stay():
         assert not rows.any() and notes == []
 
 
+def test_coarse_readings_that_were_interpolated_stay():
+    """A swing that rests in between, read by an encoder at 60 Hz and written at 100 Hz."""
+    slow = recorded(0.0)
+    read, count = np.arange(0, 4.1, 1 / 60), 2 * np.pi / 4096
+    swing = np.round(0.01 * np.sin(4 * read) ** 3 / count) * count + 0.03
+    qpos = np.stack([np.interp(slow.time, read, swing)] * 2, 1)
+    rows, notes = missing(replace(slow, qpos=qpos, qvel=np.full((400, 2), np.nan)))
+    assert not rows.any() and notes == []
+
+
 def test_rest_and_starting_from_it_stay():
     sound = recorded(0.0)
     rest = np.repeat(sound.qpos[:1], 100, axis=0)
