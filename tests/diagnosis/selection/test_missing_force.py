@@ -115,7 +115,8 @@ def test_what_an_effect_holds_is_worked_out_once_unless_a_setting_has_it(monkeyp
 
 TWO = """<mujoco><option timestep="0.002"/><worldbody><body><joint name="lift" type="slide"
   axis="0 0 1" stiffness="300"/><geom size=".05" mass="1"/><body name="rod"><joint name="swing"
-  axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></body></body></worldbody></mujoco>"""
+  axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/></body></body></worldbody>
+  </mujoco>"""
 
 
 def swung(seed, rows=300, dt=0.02):
