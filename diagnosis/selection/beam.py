@@ -251,14 +251,16 @@ def _by_windows(short, setting, inside, starts, rounds):
         grown = beam.nodes_of([(*node.options, index[start]) for start in some])
         return {start: node.unpriced - new.unpriced for start, new in zip(some, grown)}
 
+    # first every start in full: what lowers squares most is not what lowers their logarithm most
+    gains = look([starts[k] for k in beam.others(node)])
     for _ in range(rounds):
-        gains = {starts[k]: g / beam.evidence.number for k, g in beam.gains(node).items()}
         if not gains:
             break
-        _renew(gains, kept, look)
         best, further = _best(gains, kept)
         kept |= dict.fromkeys(further)
         node = beam.node((*node.options, index[best]))
+        gains = {starts[k]: g / beam.evidence.number for k, g in beam.gains(node).items()}
+        _renew(gains, kept, look)
     return list(kept)
 
 
