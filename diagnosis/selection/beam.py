@@ -18,7 +18,6 @@ WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in 
 DEPTH = 4  # effects added in one round
 CHANCE = 0.05  # that forces speak against an effect by accident
 LEAST = 0.01  # loss that an effect must remove in the search
-ENDS = "low", "high"
 GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
 MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; new ones in each
 
@@ -173,8 +172,8 @@ class Beam:
     def gains(self, node):
         """{k: nats} that options of effects which a node does not hold promise, in a first look."""
         index, *_, precision, _ = problem(self.columns, node.options)
-        bounds = [np.concatenate([getattr(o, end) for o in self.columns.options]) for end in ENDS]
-        gain = self.evidence.looks(index, node.score.amounts, precision, *bounds)
+        low, high = map(np.concatenate, zip(*((o.low, o.high) for o in self.columns.options)))
+        gain = self.evidence.looks(index, node.score.amounts, precision, low, high)
         return {k: gain[list(self.columns.options[k].columns)].sum() for k in self.others(node)}
 
     def _looks(self, node):
@@ -251,28 +250,33 @@ def _by_windows(short, setting, inside, starts, rounds):
         grown = beam.nodes_of([(*node.options, index[start]) for start in some])
         return {start: node.unpriced - new.unpriced for start, new in zip(some, grown)}
 
-    # first every start in full: what lowers squares most is not what lowers their logarithm most
-    gains = look([starts[k] for k in beam.others(node)])
     for _ in range(rounds):
-        if not gains:
+        others = beam.others(node)
+        if not others:
             break
+        if kept:
+            gains, number = beam.gains(node), beam.evidence.number
+            gains = {starts[k]: gain / number for k, gain in gains.items()}
+            _renew(gains, kept, look)
+        else:  # every start in full: what lowers squares most may lower their logarithm less
+            gains = look([starts[k] for k in others])
         best, further = _best(gains, kept)
         kept |= dict.fromkeys(further)
         node = beam.node((*node.options, index[best]))
-        gains = {starts[k]: g / beam.evidence.number for k, g in beam.gains(node).items()}
-        _renew(gains, kept, look)
     return list(kept)
 
 
 def _renew(gains, kept, look):
     """Look in full at those of {Start: gain} that are the best, of a first look, until no other
     one promises more."""
-    old = set(gains)
-    while old:
+    known = set()
+    while True:
         best, further = _best(gains, kept)
-        some = [start for start in dict.fromkeys((best, *further)) if start in old]
+        some = [start for start in dict.fromkeys((best, *further)) if start not in known]
+        if not some:
+            break
         gains |= look(some)
-        old = old - set(some) if some else ()
+        known |= {*some}
 
 
 def explained(basis, target):

@@ -372,24 +372,29 @@ class Columns:
         """Whole values of which no share means anything again, between the best of those tried and
         its neighbours among starts, as waves are moved: the criterion cannot move these, and a tone
         between two that are tried is out of step within a second."""
-        fixed = lambda s: (s.low >= s.high).all() and (s.base + s.directions[0] > 0).all()
         of = lambda start: start.base + start.directions[0]
+        fixed = lambda s: (s.low >= s.high).all() and (of(s) > 0).all() and np.isfinite(of(s)).all()
         some = [o.candidate for o in self.options if fixed(o) and o.candidate not in self.setting]
         for candidate in dict.fromkeys(some):
-            line = [s for s in starts if s.candidate is candidate and fixed(s)]
-            best = self._best_of(candidate, reference)
-            at = int(np.argmin([abs(np.log(of(s) / of(best))).sum() for s in line]))
-            steps = [np.log(of(s) / of(line[at])) for s in line[max(at - 1, 0) : at + 2]]
+            line, ways = [s for s in starts if s.candidate is candidate and fixed(s)], []
             for share in NEARER:
-                rows = [of(best) * np.exp(share * step) for step in steps if step.any()]
+                mine = [o for o in self.options if o.candidate is candidate and fixed(o)]
+                best = self._best_of(mine, reference)
+                ways = ways or _ways(of(best), [of(start) for start in line])
+                rows = [of(best) * np.exp(share * way) for way in ways]
                 rows = [row - best.base for row in rows if best.prior.inside(row)]
-                self._simulate([replace(line[at], directions=row[None]) for row in rows])
-                best = self._best_of(candidate, reference)
+                self._simulate([replace(line[0], directions=row[None]) for row in rows])
 
-    def _best_of(self, candidate, reference):
-        """The Option of one column of a candidate that leaves least."""
-        mine = [o for o in self.options if o.candidate is candidate and len(o.columns) == 1]
-        columns = np.stack([self.parts[o.columns[0]] for o in mine], -1)
-        given = [((k,), o.low, o.high, *o.quadratic()) for k, o in enumerate(mine)]
+    def _best_of(self, options, reference):
+        """The one of options with one column that leaves least."""
+        columns = np.stack([self.parts[o.columns[0]] for o in options], -1)
+        given = [((k,), o.low, o.high, *o.quadratic()) for k, o in enumerate(options)]
         scores = Evidence(self.ahead, self.residual, columns, reference).scores(given)
-        return mine[int(np.argmin([score.loss for score in scores]))]
+        return options[int(np.argmin([score.loss for score in scores]))]
+
+
+def _ways(values, line):
+    """Logs of the ratios (k,) of the neighbours of values (k,) in a line of such values to those
+    in the line that are the nearest."""
+    at = int(np.argmin([abs(np.log(each / values)).sum() for each in line]))
+    return [np.log(line[i] / line[at]) for i in (at - 1, at + 1) if 0 <= i < len(line)]
