@@ -58,7 +58,6 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "no curves in the search": {"diagnosis.selection.identification:CURVES": 0},
     "fewer starts": {"diagnosis.selection.columns:PROBES": 4},
     "one finalist": {"diagnosis.selection.identification:FINALISTS": 1},
-    "what is left may scatter as it likes": {"diagnosis.selection.missing_force:ABOVE": 0.0},
     "no single effects beside the finalists": {"diagnosis.selection.identification:ALONE": 0},
     "what touches is told by positions as they are": {"diagnosis.estimation.smoother:REACH": 0.0},
     "three tones": {"diagnosis.effects.transmissions:TONES": (4.0, 8.0, 16.0)},

@@ -178,12 +178,18 @@ def _instead(search, found, fitted, names, joint):
 
 
 def _one_curve(search, found, fitted, log):
-    """The Fitted set with one curve in the place of a curve and names of its joint, where these are
-    not earned over it: beside a curve any name fits that it makes up for."""
-    for joint in [c.place.name for c in fitted.setting if isinstance(c.effect, Unknown)]:
+    """The Fitted set with one curve, its own or another one, in the place of a curve and names of
+    its joint, where these are not earned over it: beside a curve any name fits that it makes up
+    for."""
+    for curve in [c for c in fitted.setting if isinstance(c.effect, Unknown)]:
+        joint = curve.place.name
         mine = [c for c in fitted.setting if _at(search.world, c, joint)]
-        alone = _instead(search, found, fitted, mine, joint) if len(mine) > 1 else None
-        if alone and not search.earned(alone, fitted):
+        if len(mine) < 2:
+            continue
+        own = {c: v for c, v in fitted.setting.items() if c is curve or c not in mine}
+        tries = [found.judge.fit(own, steps=2), _instead(search, found, fitted, mine, joint)]
+        alone = min(filter(None, tries), key=lambda f: f.loss)
+        if not search.earned(alone, fitted):
             log(f"  one curve at {joint}: {alone.loss:.3f} {said(alone.setting)}")
             fitted = alone
     return fitted

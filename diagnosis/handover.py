@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.estimation import windowing
+from diagnosis.estimation.readings import undone
 from diagnosis.simulation.corrected_py import ScriptError, corrected_py, predictions, python_parts
 from diagnosis.simulation.corrected_template import blown_up, divided
 from diagnosis.simulation.editable_model import FILTERS
@@ -110,27 +111,37 @@ class Check:
 
     def squares(self, files, setting, near=False):
         """Parts of the squared error of the Files of a setting (2, W), by window: from start states
-        as recorded, and as they are smoothed under it; infinite where they do not run."""
-        begun = self.windows, self.smoothed(setting, near)
-        return np.array([self._parts(files, windows) for windows in begun])
+        as recorded, and as they are smoothed under it; infinite where they do not run. What the
+        files do not hold of sensors that are off is undone in both, and in what is measured."""
+        off = {c: v for c, v in setting.items() if files.forms[c] == "measurement"}
+        both = [
+            self._undone(windows, off) for windows in (self.windows, self.smoothed(setting, near))
+        ]
+        return np.array([self._parts(files, windows, both[0]) for windows in both])
+
+    def _undone(self, windows, off):
+        """Windows of recordings as they would be without what is off."""
+        model, recordings = self.world.model, windowing.recordings_of(windows)
+        turned = {r: undone(model, off, r) for r in recordings}
+        return [w._replace(recording=turned[w.recording]) for w in windows]
 
     def worse(self, setting, other):
         """By how much a setting's files predict worse than another one's, at least."""
         mine, others = (self.squares(Files.of(self.world, s), s) for s in (setting, other))
         return _worse(mine, others)
 
-    def _parts(self, files, windows):
-        """Parts of the squared error (W,) of windows begun otherwise."""
+    def _parts(self, files, windows, measured):
+        """Parts of the squared error (W,) of windows begun otherwise than they were measured."""
         model = self.world.model
         try:
             predicted = files.predicted(model, windows)
         except (ScriptError, ValueError, mujoco.FatalError):
             return np.full(len(windows), np.inf)
-        return windowing.squares(*windowing.gaps(model, self.windows, predicted), self.noise)
+        return windowing.squares(*windowing.gaps(model, measured, predicted), self.noise)
 
     def error(self, files):
         """As errors(), of all channels; infinite where they do not run."""
-        return float(np.sqrt(self._parts(files, self.windows).sum()))
+        return float(np.sqrt(self._parts(files, self.windows, self.windows).sum()))
 
 
 def accepted(world, check, setting, refit=lambda some, out: some, log=lambda what: None, told=None):

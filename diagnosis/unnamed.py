@@ -15,7 +15,6 @@ from diagnosis.estimation import windowing
 from diagnosis.selection.criterion import BEYOND, PRICE
 from diagnosis.selection.identification import LEVEL
 from diagnosis.selection.judge import channel, share_left
-from diagnosis.selection.missing_force import ABOVE
 from diagnosis.selection.plausibility import at_limit, plausible
 
 # of a joint's error that names leave beyond a perfect simulator's, from which they are the nearest
@@ -59,20 +58,15 @@ def held_out_share(errors):
     return left, before > BEYOND * floor
 
 
-def missing_most(world, outcome, something):
+def missing_most(world, outcome):
     """The hinge or slide in which a perfect simulator would gain most, of those in which that is
-    worth the price of a force without a name, and no chance; None where there is none. Where
-    held-out recordings do not show that something is missing, the located force there has to follow
-    anything by more than it scatters: noise that is not white moves start states as well."""
+    worth the price of a force without a name, and no chance; None where there is none."""
     model, level = world.model, LEVEL / len(outcome.lacks)
-    loud = {d.joint for d in outcome.left if d.above > ABOVE}
     gains = {}
     for j in np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))):
-        name, d = model.joint(j).name, model.jnt_dofadr[j]
-        lack = outcome.lacks[channel(outcome.fitted, d)]
-        worth = lack.gain > PRICE * UNNAMED and lack.p_value < level
-        if worth and (something or name in loud):
-            gains[name] = lack.gain
+        lack = outcome.lacks[channel(outcome.fitted, model.jnt_dofadr[j])]
+        if lack.gain > PRICE * UNNAMED and lack.p_value < level:
+            gains[model.joint(j).name] = lack.gain
     return max(gains, key=gains.get, default=None)
 
 
@@ -139,7 +133,7 @@ def _at_edge(outcome, candidate):
     return at_limit(candidate, values, plausible(candidate, outcome.found.usual))
 
 
-def _unearned(world, outcome, something):
+def _unearned(world, outcome):
     """(joint or None, variables) where a force is missing that no finding tells of: that of what
     the search found and kept-back recordings spoke against, or the one that stands out most. A
     curve that was only tried beside it is not even earned."""
@@ -150,13 +144,13 @@ def _unearned(world, outcome, something):
         joint = _standing_out(world, outcome, sorted(world.joints(candidate.place) or ()))
         if joint:
             return joint, depends_on(world.model, candidate)
-    return missing_most(world, outcome, something), ()
+    return missing_most(world, outcome), ()
 
 
 def led(world, outcome, findings, something, channels):
     """Findings with `unknown` in the place of names that leave much of the error of their joint or
-    have a value at the edge of what was tried, or where something is missing and nothing has a
-    name: a finer time step is none.
+    have a value at the edge of what was tried, or where held-out recordings show that something is
+    missing and nothing has a name: a finer time step is none.
 
     findings: [(candidate or None, finding)], the most important first; channels {channel: errors}:
     of held-out recordings. Where these or those that names were found on show that they leave
@@ -166,11 +160,13 @@ def led(world, outcome, findings, something, channels):
     leads = {f["place"]["name"]: f for _, f in reversed(findings) if f["effect"] == "unknown"}
     order, shares = [], share_left(outcome.fitted)  # findings, and the joints of unknown forces
     names = {}  # that these may have
+    # joints whose held-out errors are those of sensors that files do not hold
+    off = {f["place"]["name"] for _, f in findings if f["written_as"] == "measurement"}
     for candidate, finding in findings:
         joint = finding["place"]["name"] if finding["effect"] == "unknown" else None
         if candidate and joint is None:
             at, share = main_joint(world, outcome, candidate, shares)
-            errors = channels.get(f"qpos:{at}")
+            errors = channels.get(f"qpos:{at}") if at not in off else None
             shown, clearly = held_out_share(errors) if errors else (np.inf, False)
             least = min(share, shown)
             told = least if np.isfinite(least) else None
@@ -186,7 +182,7 @@ def led(world, outcome, findings, something, channels):
         elif joint not in order:
             order.append(joint)
     physics = [f for f in order if isinstance(f, str) or not is_numerical(f["effect"])]
-    joint, on = (None, ()) if physics else _unearned(world, outcome, something)
+    joint, on = (None, ()) if physics or not something else _unearned(world, outcome)
     order += [joint] if joint else []
     told = lambda joint: leads.get(joint) or unknown(joint, outcome, on)
     force = lambda joint: beside(told(joint), names.get(joint, []))

@@ -3,14 +3,18 @@ recordings alone: a floor for what a smoother may call noise.
 
 qpos, qvel = shown(model, setting, recordings, qpos, qvel)
 qpos, qvel = behind(model, setting, recordings, qpos, qvel)
+recording = undone(model, setting, recording)
 position, velocity = measurement_noise(model, recordings)   # (nv,), (nv,); inf where never measured
 """
+
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from diagnosis.estimation.windowing import difference, joint_slices, pooled
+from diagnosis.estimation.windowing import states as filled
 from diagnosis.recordings.quality import encoder_quantum
 
 # of differences: what a smooth motion leaves falls with the order, noise does not
@@ -41,6 +45,21 @@ def later(model, setting, recordings, known):
                 known[rows, d] = np.interp(time + delay, time, known[rows, d], right=np.nan)
             known[rows, d] /= ratio
     return known
+
+
+def undone(model, setting, recording):
+    """A Recording as it would be if the sensors of hinges and slides were not off, as far as that
+    was measured."""
+    if not _measures(model, setting):
+        return recording
+    states = behind(model, setting, [recording], *filled(model, recording))
+    own = np.array(recording.qpos), np.array(recording.qvel)
+    for joint, (_, _, delay) in _measures(model, setting):
+        for read, state, k in zip(own, states, (joint.qposadr[0], joint.dofadr[0])):
+            gap = np.where(np.isfinite(read[:, k]), 0.0, 1.0)
+            hole = np.interp(recording.time + delay, recording.time, gap, right=1.0) > 0
+            read[:, k] = np.where(hole, np.nan, state[:, k])
+    return replace(recording, qpos=own[0], qvel=own[1])
 
 
 def _each(model, setting, recordings, qpos, qvel, sign, change):

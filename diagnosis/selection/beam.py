@@ -11,7 +11,7 @@ import numpy as np
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import PRICE, Score, complexity, paired
-from diagnosis.selection.judge import moved_setting, problem
+from diagnosis.selection.judge import moved_setting, nominal, problem
 from diagnosis.selection.plausibility import cost
 
 WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in each in full
@@ -24,7 +24,7 @@ MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; n
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A set of options beside those of the effects that are in the model already."""
+    """A set of options. Effects that are in the model already and not in it are nominal."""
 
     options: tuple
     score: Score
@@ -44,6 +44,8 @@ class Beam:
         inside = columns.setting
         self.kept = tuple(k for k, o in enumerate(columns.options) if o.candidate in inside)
         self.free = [k for k, o in enumerate(columns.options) if o.candidate not in inside]
+        limit = lambda k: not np.isfinite(nominal(columns.options[k])).all()
+        self.stay = set(filter(limit, self.kept))  # of which small changes tell nothing
 
     def leave(self, candidates):
         """Look for sets without the options of some candidates from now on."""
@@ -59,10 +61,13 @@ class Beam:
         fitted to, if not that of the motion."""
         evidence, keys = by or self.evidence, [(by is None, tuple(sorted(each))) for each in sets]
         new = {k: tuple(options) for k, options in zip(keys, sets) if k not in self.known}
-        given = [problem(self.columns, options) for options in new.values()]
+        given = [self._problem(options) for options in new.values()]
         for key, (index, *_), score in zip(new, given, evidence.scores(given)):
             self.known[key] = self._node(new[key], index, score, evidence)
         return [self.known[k] for k in keys]
+
+    def _problem(self, options):
+        return problem(self.columns, options, [k for k in self.kept if k not in options])
 
     def _node(self, options, index, score, evidence):
         """The Node of options, of columns index, with a Score by an Evidence."""
@@ -151,11 +156,11 @@ class Beam:
         return frozenset(self.columns.options[k].candidate for k in node.options)
 
     def _reduced(self, node, start, met):
-        """Meet the sets that are left when effects go again, the one that is missed least first,
-        as long as that is better."""
-        while len(node.options) > len(self.kept) + 1:
-            added, fewer = node.options[len(self.kept) :], []
-            for less in self.nodes_of([[k for k in node.options if k != out] for out in added]):
+        """Meet the sets that are left when effects go again, those of the model too, the one that
+        is missed least first, as long as that is better."""
+        while len(node.options) > 1:
+            goes, fewer = [k for k in node.options if k not in self.stay], []
+            for less in self.nodes_of([[k for k in node.options if k != out] for out in goes]):
                 if not self._against(start, less):
                     met[less] = None
                     fewer.append(less)
@@ -171,7 +176,7 @@ class Beam:
 
     def gains(self, node):
         """{k: nats} that options of effects which a node does not hold promise, in a first look."""
-        index, *_, precision, _ = problem(self.columns, node.options)
+        index, *_, precision, _ = self._problem(node.options)
         low, high = map(np.concatenate, zip(*((o.low, o.high) for o in self.columns.options)))
         gain = self.evidence.looks(index, node.score.amounts, precision, low, high)
         return {k: gain[list(self.columns.options[k].columns)].sum() for k in self.others(node)}
@@ -190,7 +195,9 @@ class Beam:
 
     def setting(self, node):
         """The setting {Candidate: values} of a node."""
-        return moved_setting(self.columns, node.score.amounts, node.options)
+        moved = moved_setting(self.columns, node.score.amounts, node.options)
+        inside = self._candidates(node)
+        return {c: v for c, v in moved.items() if c in inside}
 
 
 def likely(missing, starts):

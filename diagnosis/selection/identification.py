@@ -161,7 +161,8 @@ class Identification:
         are as good are carried on."""
         earlier = carried(judge, self.sets, now, best)
         better = [f for f in earlier if f.settled and f.loss < best.loss - TIED]
-        best = min([best, *better], key=lambda f: f.loss)
+        if better:  # it was judged in its round, and no more
+            best = self.pruned(judge, min(better, key=lambda f: f.loss), judge.fit({}))
         self.sets = as_good(judged + earlier, best)
         return best
 
@@ -180,34 +181,35 @@ class Identification:
         and more, and not one that predicts the same: classes are told later. A column begun far
         from the truth may not be worth its price yet, but no chance. And the best single effects
         beside them: where something touches, columns tell little of whole values."""
-        chosen, seen = [], []
+        chosen, seen, options = [], [], beam.columns.options
         for node in nodes:
             if len(chosen) == FINALISTS:
                 break
-            options = beam.columns.options
-            added = [options[k].candidate for k in node.options[len(start.options) :]]
+            added = set(node.options) - set(start.options)
             chance = not self.no_chance(paired(start.score, node.score), len(added))
-            if node.loss >= start.loss and chance:
+            if not added or (node.loss >= start.loss and chance):
                 continue
-            names = set(map(one, added))
-            same = [abs(node.score.groups - c.score.groups).max() < LEAST for c in chosen]
+            names = {one(options[k].candidate) for k in set(node.options) ^ set(start.options)}
+            same = [abs(node.score.groups - n.score.groups).max() < LEAST for n in [start, *chosen]]
             if not any(same) and not any(names >= better for better in seen):
                 seen.append(names)
                 chosen.append(node)
         alone = {}
         for node in nodes:
-            if len(node.options) == len(start.options) + 1:
-                alone.setdefault(one(beam.columns.options[node.options[-1]].candidate), node)
+            if len(node.options) == len(start.options) + 1 and node.options[:-1] == start.options:
+                alone.setdefault(one(options[node.options[-1]].candidate), node)
         return chosen, [n for n in list(alone.values())[:ALONE] if n not in chosen]
 
     def _choose(self, judged, now):
         """The simplest set that is earned over what there was and over which the best set is not
-        earned. Where the best is not earned over what there was, that stays."""
+        earned, or, of other effects, is worth little more. Where the best is not earned over what
+        there was, that stays."""
         best = min((f for f in judged if f is now or f.settled), key=lambda f: f.loss)
         if best is now or not self.earned(now, best):
             return now
         good = [f for f in judged if f.settled and f is not now and self.earned(now, f)]
-        good = [f for f in good if f is best or not self.earned(f, best)]
+        tied = lambda f: f.loss < best.loss + TIED and f.setting.keys() - best.setting.keys()
+        good = [f for f in good if f is best or tied(f) or not self.earned(f, best)]
         return min(good, key=lambda f: (complexity(f.setting), f.loss))
 
     @staticmethod

@@ -118,29 +118,36 @@ class Judge:
         return sum(cost(c, v, plausible(c, self.usual)) for c, v in setting.items())
 
 
-def problem(columns, chosen):
-    """(indices, low, high, precision, pull) of options, for Evidence.score."""
-    options = [columns.options[k] for k in chosen]
+def nominal(option):
+    """Amounts (p,) of an option without its effect; infinite of a limit that there was not."""
+    away = np.array(option.candidate.nominal) - option.base
+    return np.array([away[row != 0][0] / row[row != 0][0] for row in option.directions])
+
+
+def problem(columns, chosen, gone=()):
+    """(indices, low, high, precision, pull) of options, for Evidence.score: of some that are chosen
+    and of effects that are nominal then."""
+    options = [columns.options[k] for k in (*chosen, *gone)]
     if not options:
         return (), *[np.zeros(0)] * 4
     parts = zip(*((o.low, o.high, *o.quadratic()) for o in options))
-    return [i for o in options for i in o.columns], *map(np.concatenate, parts)
+    index, (low, high, *prior) = [i for o in options for i in o.columns], map(np.concatenate, parts)
+    for k in gone:
+        inside = np.isin(index, columns.options[k].columns)
+        low[inside] = high[inside] = nominal(columns.options[k])
+    return index, low, high, *prior
 
 
 def without(fitted, candidate):
     """A Fitted set when an effect of it becomes nominal and the others move, as far as its columns
     tell. Of a limit that there was not they tell nothing, so it is as if none missed it."""
-    columns = fitted.columns
-    index, low, high, precision, pull = problem(columns, range(len(columns.options)))
-    away = np.array(candidate.nominal) - fitted.setting[candidate]
+    options = fitted.columns.options
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
-    for option in columns.options:
-        if option.candidate is candidate:
-            gone = [away[row != 0][0] / row[row != 0][0] for row in option.directions]
-            if not np.isfinite(gone).all():
-                return replace(fitted, setting=rest, score=replace(fitted.score, loss=-np.inf))
-            low[list(option.columns)] = high[list(option.columns)] = gone
-    score = fitted.evidence.score(index, low, high, precision, pull)
+    gone = [k for k, o in enumerate(options) if o.candidate is candidate]
+    if not all(np.isfinite(nominal(options[k])).all() for k in gone):
+        return replace(fitted, setting=rest, score=replace(fitted.score, loss=-np.inf))
+    kept = [k for k in range(len(options)) if k not in gone]
+    score = fitted.evidence.score(*problem(fitted.columns, kept, gone))
     return replace(fitted, setting=rest, score=score)
 
 

@@ -28,7 +28,6 @@ FINE, KNOTS = 33, 9  # places over the range where a curve may bend, and values 
 BLOCKS = 16  # stretches of time that are left out in turn
 # share of the located force's variance, predicted on stretches left out, that a curve must explain
 LEAST = 0.03
-ABOVE = 1.0  # of its scatter, by which a force that is left follows something, to be asked after
 # periods over the travel, or a recording, from, to and by, of forces that come and go
 WAVES = 1.0, 30.0, 0.1
 # radians of such a wave for each of the variable's own unit, at least: gravity has one a radian

@@ -217,21 +217,37 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
 
 
 @pytest.mark.parametrize(
-    "joint, earned, bare", [(0, False, True), (0, True, False), (1, False, False)]
+    "joint, own, earned, chosen",
+    [
+        (0, 0.0, ["own"], "other"),
+        (0, -2.0, ["other"], "own"),
+        (0, -2.0, ["own"], "both"),  # chance decides nothing for one that is worse
+        (0, 0.0, ["other"], "both"),
+        (1, 0.0, [], "both"),
+    ],
 )
-def test_a_name_beside_a_curve_of_its_joint_has_to_be_earned_over_one_curve(
-    monkeypatch, joint, earned, bare
+def test_a_name_beside_a_curve_of_its_joint_has_to_be_earned_over_the_better_curve(
+    monkeypatch, joint, own, earned, chosen
 ):
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     curve, name = world.curve("pivot", "time", (0.0, 1.0)), world.candidate("back_emf", "drive")
     both = SimpleNamespace(setting={curve: (0.1, 0.1), name: (0.1,)})
-    alone = SimpleNamespace(setting={curve: (0.2, 0.1)}, loss=-1.0)
+    sets = {
+        "both": both,
+        "other": SimpleNamespace(setting={curve: (0.2, 0.1)}, loss=-1.0),
+        "own": SimpleNamespace(setting={curve: (0.1, 0.1)}, loss=own),
+    }
     monkeypatch.setattr(world, "joints", lambda place: (joint if place.name == "drive" else 0,))
-    asked = lambda search, found, fitted, names, joint: alone if {*names} == {curve, name} else None
+    asked = lambda search, found, fitted, names, joint: {*names} == {curve, name} and sets["other"]
     monkeypatch.setattr(estimator, "_instead", asked)
-    search = SimpleNamespace(world=world, earned=lambda before, after: earned)
-    told = estimator._one_curve(search, None, both, lambda what: None)
-    assert told is (alone if bare else both)
+    judge = SimpleNamespace(
+        fit=lambda setting, steps: setting == sets["own"].setting and sets["own"]
+    )
+    search = SimpleNamespace(
+        world=world, earned=lambda before, after: any(before is sets[name] for name in earned)
+    )
+    told = estimator._one_curve(search, SimpleNamespace(judge=judge), both, lambda what: None)
+    assert told is sets[chosen]
 
 
 @pytest.mark.parametrize(

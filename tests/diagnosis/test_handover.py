@@ -1,6 +1,7 @@
 """Nothing is handed over that predicts kept-back recordings worse, or that they do not need."""
 
 from copy import copy
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -9,6 +10,7 @@ import pytest
 from plants import DRIVEN_PENDULUM, NOISE, recorded, reported_error
 
 from diagnosis.estimation import windowing
+from diagnosis.estimation.readings import shown, undone
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.handover import Check, Files, accepted
 from diagnosis.simulation.simulator import World
@@ -161,3 +163,24 @@ def test_windows_begin_at_the_motion_of_their_own_setting_whatever_was_asked_bef
 
     # rad and rad/s; along the other transitions it would be ten times as much
     assert abs(begun(True) - begun(False)).max() < 3e-3
+
+
+@pytest.mark.parametrize("name, value", [("sensor_scale", 0.9), ("sensor_delay", 0.03)])
+def test_what_a_sensor_that_is_off_shows_speaks_against_nothing_that_is_true(name, value):
+    """Files do not hold it: positions as they are read lie where no force of theirs holds them."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    true, model = recorded("held.csv", 7, damping=0.1, seconds=6.0), world.model
+    off, damping = world.candidate(name, "pivot"), world.candidate("viscous_damping", "pivot")
+    states = windowing.states(model, true)
+    qpos, qvel = shown(model, {off: (value,)}, [true], *states)
+    run = replace(true, qpos=qpos, qvel=np.full_like(qvel, np.nan))
+    back = undone(model, {off: (value,)}, run)
+    seen = np.isfinite(back.qpos[:, 0])
+    assert seen[:-10].all() and (~seen).any() == (name == "sensor_delay")
+    assert abs(back.qpos - true.qpos)[seen][5:].max() < 3 * NOISE
+    assert undone(model, {damping: (0.1,)}, run) is run
+    check = Check(world, [run], Smoother(world, [run]), np.array([NOISE]))
+    both = {off: (value,), damping: (0.1,)}
+    squares = lambda setting: check.squares(Files.of(world, setting), setting).sum(1)
+    assert (squares(both) < 0.5 * squares({off: (value,)})).all()
+    assert set(accepted(world, check, both).setting) == set(both)

@@ -123,6 +123,19 @@ def test_held_out_recordings_say_what_a_name_leaves_as_well(
     assert only["effect"] == effect and only["evidence"].get("error_left") == share
 
 
+def test_files_tell_nothing_of_a_joint_whose_sensor_is_off():
+    scale = WORLD.candidate("sensor_scale", "elbow")
+    given = outcome(smoothed(1.0), 0.1, DEPENDS)
+    given.fitted.setting[scale] = (0.9,)
+    errors = {"qpos:elbow": {"before": 10.0, "after": 8.0, "floor": 3.0}}
+    off = finding(scale, written="measurement")
+    told = led(WORLD, given, [off, finding(FRICTION)], True, errors)
+    assert [f["effect"] for f in told] == ["sensor_scale", "coulomb_friction"]
+    off[1]["written_as"] = "mjcf"
+    told = led(WORLD, given, [off, finding(FRICTION)], True, errors)
+    assert [f["effect"] for f in told] == ["unknown"]
+
+
 def test_a_finer_step_is_no_name_for_a_force():
     step = WORLD.candidate("time_step", "world")
     given = outcome(smoothed(1.0), 0.7, DEPENDS, gains=(0, 0))
@@ -195,7 +208,11 @@ def test_where_nothing_has_a_name_the_joint_that_lacks_most_is_told():
 
 
 def test_a_finer_time_step_is_no_name():
-    finer = {"effect": "time_step", "place": {"kind": "world", "name": "world"}}
+    finer = {
+        "effect": "time_step",
+        "place": {"kind": "world", "name": "world"},
+        "written_as": "mjcf",
+    }
     loud = outcome(smoothed(0.3), gains=(1.0, 0.9))
     kept, force = led(WORLD, loud, [(None, finer)], True)
     assert kept == finer and force["place"]["name"] == "shoulder"
@@ -217,12 +234,9 @@ def test_a_force_without_a_name_is_told_only_where_a_perfect_simulator_is_worth_
     assert places(chance, True) == ["elbow"]
 
 
-def test_what_held_out_recordings_do_not_show_the_located_force_has_to():
-    quiet = outcome(smoothed(0.3), depends=DEPENDS, gains=(1.0, 0.9))
-    assert places(quiet, False) == ["shoulder"]  # twice as much as it scatters
-    quiet.left[1].above = 0.9
-    assert places(quiet, False) == ["elbow"]
-    assert places(outcome(smoothed(0.3)), False) == []  # it follows nothing
+def test_what_held_out_recordings_do_not_show_is_no_claim():
+    loud = outcome(smoothed(0.3), depends=DEPENDS, gains=(1.0, 0.9), gone=[FRICTION])
+    assert places(loud, True) == ["elbow"] and places(loud, False) == []
 
 
 def test_an_unknown_force_names_the_variables_that_it_follows_best():
@@ -236,15 +250,15 @@ def test_what_kept_back_recordings_spoke_against_is_an_unknown_force_at_its_join
     loud = smoothed(0.3, shoulder=0.9)
     elsewhere = [d for d in DEPENDS if d[0] == "shoulder"]
     given = outcome(loud, depends=elsewhere, gone=[FRICTION])
-    [only] = led(WORLD, given, [], False)
+    [only] = led(WORLD, given, [], True)
     assert (only["effect"], only["place"]["name"]) == ("unknown", "elbow")
     assert only["depends_on"] == ["velocity:elbow"] and not only["adequate"]
-    [only] = led(WORLD, outcome(loud, depends=DEPENDS, gone=[FRICTION]), [], False)
+    [only] = led(WORLD, outcome(loud, depends=DEPENDS, gone=[FRICTION]), [], True)
     assert only["depends_on"] == ["velocity:elbow", "position:elbow"]  # what it leaves as well
-    kept = led(WORLD, outcome(loud, 0.1, gone=[FRICTION]), [finding(MASS)], False)
+    kept = led(WORLD, outcome(loud, 0.1, gone=[FRICTION]), [finding(MASS)], True)
     assert [f["effect"] for f in kept] == ["mass"]
     curve = WORLD.curve("elbow", "position:elbow", (0.0, 0.5, 1.0))  # tried, and never earned
-    assert led(WORLD, outcome(loud, gone=[curve]), [], False) == []
+    assert led(WORLD, outcome(loud, gains=(0, 0), gone=[curve]), [], True) == []
 
 
 def test_what_lies_within_the_noise_says_nothing_against_a_name():

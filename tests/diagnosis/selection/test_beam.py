@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from synthetic import clustered, evidence_of, scene
 
 from diagnosis.effects.unmodelled import Unknown
@@ -68,19 +69,22 @@ def test_a_curve_is_met_alone_and_not_beside_others():
     assert met == {frozenset(), frozenset({"curve"}), frozenset({"name"})}
 
 
-def made(named, residual, ahead, prices=()):
-    """A Beam over columns {name: column}, with what each is more than a first thing to think of."""
+def made(named, residual, ahead, prices=(), inside=()):
+    """A Beam over columns {name: column}, with what each is more than a first thing to think of;
+    inside: names of effects of the model, each at 1."""
     rows = enumerate(named)
     vague = Prior(np.zeros(1), np.full(1, np.inf), np.full(1, -9.0), np.full(1, 9.0))
     bounds = np.full(1, -9.0), np.full(1, 9.0)
+    base = lambda name: np.full(1, 1.0 if name in inside else 0.0)
     options = [
-        Option(Named(n), np.zeros(1), np.ones((1, 1)), *bounds, vague, columns=(k,))
-        for k, n in rows
+        Option(Named(n), base(n), np.ones((1, 1)), *bounds, vague, columns=(k,)) for k, n in rows
     ]
+    setting = {o.candidate: (1.0,) for o in options if o.candidate.name in inside}
     for option, simplicity in zip(options, prices):
         option.candidate.effect.simplicity = simplicity
     columns = np.stack(list(named.values()), -1)
-    beam = Beam(SimpleNamespace(options=options, setting={}), evidence_of(ahead, residual, columns))
+    given = SimpleNamespace(options=options, setting=setting)
+    beam = Beam(given, evidence_of(ahead, residual, columns))
     return beam, lambda node: {options[k].candidate.name for k in node.options}
 
 
@@ -115,6 +119,27 @@ def test_sets_are_met_without_what_is_left_out():
     beam.leave({beam.columns.options[0].candidate})
     start, nodes = beam.nodes()
     assert not any("first" in names(node) for node in nodes) and "both" in names(nodes[0])
+
+
+@pytest.mark.parametrize("limit", [False, True])
+def test_what_made_up_for_an_effect_goes_when_that_joins(limit):
+    """But for a limit, of whose absence columns tell nothing."""
+    rng, ahead = np.random.default_rng(6), scene()
+    true, other, rest = (clustered(rng, ahead, share=0.0) for _ in range(3))
+    mimic = 0.5 * true + 0.5 * other
+    named = {"mimic": mimic, "true": true}
+    beam, names = made(named, true - mimic + 0.01 * rest, ahead, inside=["mimic"])
+    if limit:
+        beam.columns.options[0].candidate.nominal = (np.inf,)
+        beam = Beam(beam.columns, beam.evidence)
+    start, nodes = beam.nodes()
+    assert names(start) == {"mimic"}
+    assert names(nodes[0]) == ({"mimic", "true"} if limit else {"true"})
+    setting = {c.name: values for c, values in beam.setting(nodes[0]).items()}
+    assert setting.keys() == names(nodes[0])
+    assert setting["true"] == pytest.approx((1.0,), rel=0.05)
+    if not limit:  # a further look is taken at what is left without it
+        assert beam.gains(nodes[0]).keys() <= {0}
 
 
 def test_what_many_joints_lack_is_met_at_once_where_the_missing_force_shows_it(monkeypatch):

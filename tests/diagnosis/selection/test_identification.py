@@ -66,6 +66,11 @@ def test_a_set_is_chosen_for_its_worth(search):
     assert search._choose([now, friction, both, bound], now) is friction
     assert search._choose([now, friction, better], now) is better
     assert search._choose([now, little], now) is now  # not worth its price
+    for more, chosen in ((0.9, False), (1.1, True)):  # other effects have to be worth a little
+        names = ["armature", "viscous_damping"]
+        price = fitted(search, names, 0.0).loss
+        other = fitted(search, names, friction.loss - price - more * identification.TIED)
+        assert search._choose([now, friction, other], now) is (other if chosen else friction)
     chance = fitted(search, ["armature", "coulomb_friction"], -2.0)
     odd = np.where(np.arange(16) % 2, 4.0, -4.0)
     chance.score = Score(chance.score.loss, chance.score.groups + odd, np.zeros(16), ())
@@ -81,7 +86,10 @@ def test_a_set_of_an_earlier_round_takes_over_where_it_is_better(
     best = fitted(search, ["coulomb_friction"], -1.0)
     other = fitted(search, ["viscous_damping"], loss, settled)
     monkeypatch.setattr(identification, "carried", lambda *given: [other])
-    assert search._beside(None, [best], best, best) is (other if takes else best)
+    bare, needed = fitted(search, [], 0.0), fitted(search, ["viscous_damping"], loss)
+    monkeypatch.setattr(search, "pruned", lambda judge, some, now: now is bare and needed)
+    judge = SimpleNamespace(fit=lambda setting: bare)
+    assert search._beside(judge, [best], best, best) is (needed if takes else best)
     assert search.sets == ([other] if loss == -1.05 else [])  # as good, and carried on
 
 
@@ -177,6 +185,14 @@ def test_finalists_are_worth_their_price_or_no_chance_and_predict_differently(se
     finalists, alone = search._finalists(beam, start, nodes)
     assert finalists == [more, worth, dear]
     assert alone == [same, luck]  # simple sets are judged whatever columns tell of them
+    # beside what there was: instead of it, with it, as good as it is, and without it
+    start, instead, both = (
+        node(noise, 0.1, 0),
+        node(noise - 0.8, 0.1, 1),
+        node(noise - 0.7, 0.2, 0, 1),
+    )
+    nodes = [instead, both, node(noise + 1e-3, 0.1, 2), node(noise - 0.5, 0.0)]
+    assert search._finalists(beam, start, nodes) == ([instead, both], [])
 
 
 def test_single_curves_of_a_joint_take_one_place_among_those_that_are_judged(search):
