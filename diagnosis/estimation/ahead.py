@@ -80,6 +80,11 @@ class Ahead:
         self.spread = FREE * np.concatenate([trajectory.qpos_sd[rows], trajectory.qvel_sd[rows]], 1)
         self.base, self._freedom = setting or {}, None
 
+    def heavier(self, setting, options):
+        """(columns, nv): share of its inertia that a unit of each column of Options adds to a
+        joint, where columns leave that out: none, for here they are simulated."""
+        return np.zeros((sum(len(option.columns) for option in options), self.model.nv))
+
     def freedom(self):
         """(W, T, nv, 2 nv): how predictions change per standard deviation of the start states."""
         if self._freedom is None:

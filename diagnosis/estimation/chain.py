@@ -15,6 +15,7 @@ import numpy as np
 from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import GROUPS, Ahead, with_own_step
 from diagnosis.simulation.rows import RowMap, coarse
+from diagnosis.simulation.simulator import Case
 
 GROUPED = 19  # rows in each group, in which forces are compared
 OUTSIDE = 0.1  # share of a located force that may hang by rows outside of the windows
@@ -22,6 +23,7 @@ OUTSIDE = 0.1  # share of a located force that may hang by rows outside of the w
 INERTIAL = (
     "body_mass body_inertia body_ipos body_iquat body_pos dof_armature tendon_armature".split()
 )
+POSES = 20  # of the motion, at which inertias are compared
 ASTRAY = 1e3  # times its travel, to where a chain of transitions at stiff stops may run away
 
 
@@ -186,6 +188,32 @@ class Chain(Ahead):
         for row, m in zip(out, more):
             if m:
                 row += self.beyond[frozenset(m.items())]
+
+    def heavier(self, setting, options):
+        """As of Ahead. What rows leave are forces over the inertia of the chain's model: the same
+        forces move a lighter joint farther."""
+        out, now = super().heavier(setting, options), self._inertia(self.plain(setting))
+        for option in options:
+            if not self.apart(option.candidate):
+                for column, values in zip(option.columns, option.base + option.directions):
+                    moved = {**setting, option.candidate: tuple(values.tolist())}
+                    out[column] = self._inertia(self.plain(moved)) / now - 1
+        return out
+
+    def _inertia(self, setting):
+        """(nv,): diagonal of the inertia matrix under a plain setting, the mean over states."""
+        case = Case(self.model, setting, 1)
+        working = self.world.engine(case.structure).working
+        model = working.edited(case.on, case.step)
+        data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
+        out, every = np.full(model.nv, 1e-300), windowing.evenly(len(self.used), POSES)
+        for row in self.used[every]:
+            data.qpos[working.q] = self.trajectory.qpos[row]
+            mujoco.mj_fwdKinematics(model, data)
+            mujoco.mj_makeM(model, data)
+            mujoco.mj_fullM(model, data, full)
+            out += np.diag(full)
+        return out[working.v]
 
     def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""

@@ -153,9 +153,8 @@ class Starts:
 
 def _full(candidate, base, rows, prior):
     """The Start of a group of whole values (p, k)."""
-    finite, together = np.isfinite(base).all(), len(rows)
+    finite, together, (low, high) = np.isfinite(base).all(), len(rows), FULL
     start = base if finite else np.zeros_like(base)
-    low, high = FULL
     if together > 1:  # waves act in proportion, as far as is plausible
         high = prior.high[0] / rows[0, 0]
         low = -high
@@ -290,7 +289,8 @@ class Columns:
 
     def evidence(self, reference=None):
         """The Evidence of the residual and all columns."""
-        return Evidence(self.ahead, self.residual, self.array, reference)
+        ahead, heavier = self.ahead, self.ahead.heavier(self.setting, self.options)
+        return Evidence(ahead, self.residual, self.array, reference, heavier)
 
     @property
     def array(self):

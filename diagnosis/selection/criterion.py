@@ -24,6 +24,7 @@ from diagnosis.selection.sums import INDEPENDENT, Sums
 
 NOISE = 0.3  # of the noise, that counts as none
 BEYOND = 1.5  # of the noise, from which on an error counts
+LIGHTEST = 0.01  # share of its inertia that a joint is taken to have at least
 ITERATIONS = 4  # of reweighted least squares
 TOGETHER = 16  # hypotheses that are worked out at once
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
@@ -81,14 +82,17 @@ class Evidence:
     state is free within what the smoother knows of it: under every hypothesis the likeliest one,
     given the errors that this leaves."""
 
-    def __init__(self, ahead, residual, columns=None, reference=None):
+    def __init__(self, ahead, residual, columns=None, reference=None, heavier=None):
         """columns: none by default; reference (G, cells): mean squared errors of what others are
-        compared with; None takes this residual's."""
+        compared with; None takes this residual's. heavier (K, nv): see Ahead; none by default."""
         columns = np.zeros((*residual.shape, 0)) if columns is None else columns
         groups, bands = ahead.group.max() + 1, range(ahead.band.max() + 1)
         cells = [(dofs, b) for dofs in ahead.channels for b in bands]
         stack = np.concatenate([residual[..., None], columns, ahead.freedom()], -1)
         self.channels = len(ahead.channels)
+        heavier = np.zeros((columns.shape[-1], residual.shape[-1])) if heavier is None else heavier
+        each = [heavier[:, dofs].mean(1) for dofs in ahead.channels for _ in bands]
+        self.heavier = np.stack(each, -1)  # (K, cells)
         self.noise, rows, positions = np.zeros(len(cells)), {}, {}
         position = np.arange(residual[0].size).reshape(residual[0].shape)
         counted = np.zeros((len(residual), len(cells)))
@@ -228,6 +232,9 @@ class Evidence:
         matrix, vector, low, high = (x[:, None] for x in prior)
         matrix, vector = rest[..., 1:, 1:] + matrix, rest[..., 1:, 0] + vector
         squares = self.square_of(products, bounded(matrix, vector, low, high))
+        # of a heavier joint it is left out: noise in torques would speak for it
+        inertia = 1 + np.einsum("bp,bpc->bc", amounts, self.heavier[columns])
+        squares = squares / np.clip(inertia, LIGHTEST, 1.0)[:, None] ** 2
         return [self._scored(*self._logs(square), own) for square, own in zip(squares, amounts)]
 
     def _fitted(self, products, prior):

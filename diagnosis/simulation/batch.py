@@ -11,13 +11,15 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
+from diagnosis.common.broyden import nearest
 from diagnosis.simulation.editable_model import BALL, FREE, Working
 from diagnosis.simulation.readout import locate, read
 from diagnosis.simulation.run_up import run_up
 from diagnosis.simulation.stepwise import Stepwise
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-SHOTS = 5  # corrections of a start that delayed sensors show late
+SHOTS = 8  # corrections of a start that delayed sensors show late
+SMALL = 1e-5  # rad, m, rad/s or m/s by which such a start is moved, to tell what that shows
 
 
 class Engine:
@@ -83,21 +85,33 @@ class Engine:
 
     def _shoot(self, cases, recordings, begin, states, shown, early, measures, step, lead):
         """Correct states (qpos, qvel, act) in place until delayed sensors show what they should
-        `early` seconds later, within `lead` steps."""
+        `early` seconds later, within `lead` steps: begun as if nothing pushed until then."""
         qpos, qvel, act = states
-        q, v = self.true(*shown, measures)
-        for _ in range(SHOTS):
-            trial = self.trajectory(cases, recordings, begin, qpos, qvel, step, lead, act=act)
-            found = read(
-                self.nominal,
-                trial[0][..., self.q],
-                trial[1][..., self.v],
-                early[:, None],
-                step,
-                measures[2],
-            )
-            qpos[:, self.q] += q - found[0][:, 0]
-            qvel[:, self.v] += v - found[1][:, 0]
+        target, nq = np.concatenate(self.true(*shown, measures), 1), len(self.q)
+        ahead = early[:, None] - measures[2]  # from the first state to what is shown of each joint
+
+        def missed(x, times=1):  # by so many states of each simulation, (times n, ·)
+            tiled = lambda array: np.tile(array, (times, *[1] * (array.ndim - 1)))
+            full, more = (tiled(qpos), tiled(qvel)), act if act is None else tiled(act)
+            full[0][:, self.q], full[1][:, self.v] = x[:, :nq], x[:, nq:]
+            given = cases * times, recordings * times, tiled(begin)
+            q, v, *_ = self.trajectory(*given, *full, step, lead, act=more)
+            late, delay = tiled(early)[:, None], tiled(measures[2])
+            seen = read(self.nominal, q[..., self.q], v[..., self.v], late, step, delay)
+            return tiled(target) - np.concatenate([part[:, 0] for part in seen], 1)
+
+        position, speed = simple(self.nominal)
+        first, some = target.copy(), np.concatenate([position, nq + speed])
+        first[:, position] -= ahead * target[:, nq + speed]
+        slope = np.tile(np.eye(target.shape[1]), (len(target), 1, 1))
+        moved = first + SMALL * np.eye(target.shape[1])[some][:, None]
+        change = missed(first) - missed(moved.reshape(-1, first.shape[1]), len(some)).reshape(
+            moved.shape
+        )
+        slope[:, :, some] = np.nan_to_num(np.moveaxis(change, 0, -1) / SMALL)
+        size = np.where(np.arange(target.shape[1]) < nq, 1.0, early[:, None])
+        best = nearest(missed, first, slope, size, SHOTS)
+        qpos[:, self.q], qvel[:, self.v] = best[:, :nq], best[:, nq:]
 
     def _read(self, q, v, time, step, measures):
         """qpos (n, rows, nq), qvel (n, rows, nv) as the joints' sensors show a trajectory at times

@@ -10,6 +10,9 @@ from plants import DRIVEN_PENDULUM, NOISE, SIZES, arm, record, recorded
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain, _as_heavy
 from diagnosis.estimation.smoother import Smoother
+from diagnosis.selection.columns import Columns, Starts
+from diagnosis.selection.criterion import Evidence
+from diagnosis.selection.plausibility import Usual
 from diagnosis.simulation import rows
 from diagnosis.simulation.simulator import World
 
@@ -208,3 +211,33 @@ def test_whether_a_models_inertia_is_another_one_is_told_of_every_effect():
                 changed.add(candidate.effect.name)
                 assert not _as_heavy(model, world.model), candidate
     assert changed >= {"mass", "center_of_mass", "armature", "coupled_inertia", "link_length"}
+
+
+def test_forces_that_are_left_move_a_lighter_arm_farther():
+    """All of its forces and its mass halved, an arm is predicted as before, and errs as much."""
+    push = lambda time, q, v: -0.1 * np.tanh(v / 0.01)
+    runs = [recorded(f"{k}.csv", k, push=push, seconds=8.0) for k in range(2)]
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    smoother = Smoother(world, runs)
+    path, noise = smoother.locate({}), np.array([NOISE])
+    chain, ahead = Chain(world, cut_ahead(runs), noise), Ahead(world, cut_ahead(runs), noise)
+    chain.start(path)
+    ahead.start(path)
+    halves = {("mass", "arm"): 0.5, ("gain", "drive"): 1.0, ("viscous_damping", "pivot"): 0.05}
+    halves = {world.candidate(*c): 0.5 * value for c, value in halves.items()}
+    columns = Columns(chain, {}, Starts(world, {}, Usual(world, runs, smoother.scale)).of(halves))
+    options = {o.candidate: o for o in columns.options if not o.whole}
+    assert options.keys() == halves.keys()
+    evidence = columns.evidence()
+    index = [k for o in options.values() for k in o.columns]
+    heavier = evidence.heavier[index, 0]
+    each = zip(options.values(), (halves[c] for c in options))
+    fixed = np.array([(v - o.base[0]) / o.directions[0, 0] for o, v in each])
+    free = np.zeros(3)
+    score = evidence.score(index, fixed, fixed, free, free)
+    simulated = ahead.residual([{}, {c: (v,) for c, v in halves.items()}])
+    other = Evidence(ahead, simulated[1], reference=Evidence(ahead, simulated[0]).reference)
+    lost = other.at((), np.zeros(0)).loss
+    assert abs(lost) < 1e-6 and abs(score.loss) < 0.1
+    assert 1 + heavier @ fixed == pytest.approx(0.5)
+    assert evidence.at(index, fixed).loss < -0.5  # as columns alone have it

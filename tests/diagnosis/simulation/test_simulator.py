@@ -544,3 +544,22 @@ def test_what_acts_under_a_condition_that_never_holds_changes_nothing(kind):
             continue
         [moved] = simulate(world, [{timed: SIZES[name]}], recording)
         np.testing.assert_allclose(moved, plain, atol=2e-4, err_msg=name)
+
+
+def test_a_window_goes_on_where_the_run_was_beside_a_late_sensor():
+    """Though the other joint turns round before the late one shows what was."""
+    world = World(
+        mujoco.MjSpec.from_string("""<mujoco><option timestep="0.001"/><worldbody><body>
+      <joint name="late" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"/>
+      <body pos="0 0 -.3"><joint name="stiff" axis="0 1 0" stiffness="8"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"/></body></body></worldbody>
+      </mujoco>""")
+    )
+    recording = commanded(0.005 * np.arange(200), joints=2)
+    setting = {world.candidate("sensor_delay", "late"): (0.06,)}
+    whole = Window(recording, 0, 199)
+    qpos, qvel = world.simulate([setting], [[0.5, 0.4]], [[0.0, 0.0]], [whole])
+    window = Window(recording, 100, 160)
+    later = world.simulate([setting], qpos[:, 100], qvel[:, 100], [window])[0]
+    assert np.ptp(qpos[0, 88:100, 1]) > 0.2  # rad
+    np.testing.assert_allclose(later[0], qpos[0, 100:161], rtol=0, atol=1e-3)
