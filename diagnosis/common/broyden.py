@@ -1,18 +1,19 @@
 """Many small systems of equations at once, by Broyden's method (1965, doi:10.2307/2003941).
 
-x = nearest(missed, x, slope, size, rounds)
+x = nearest(missed, x, missed(x), slope, size, rounds)
 """
 
 import numpy as np
 
 
-def nearest(missed, x, slope, size, rounds):
+def nearest(missed, x, off, slope, size, rounds):
     """Of all x (n, k) that are tried, of each of n systems the one at which least is missed.
 
-    missed(x): (n, k), what each system misses; x: where to begin; slope (n, k, k): minus its
-    derivative there; size (n, k): weights of what is missed; rounds: trials beside the first.
+    missed(x): (n, k), what each system misses; x: where to begin; off: missed(x) there;
+    slope (n, k, k): minus its derivative; size (n, k): weights of what is missed; rounds: trials
+    beside the first.
     """
-    off, inverse = missed(x), np.linalg.pinv(slope)
+    inverse = np.linalg.pinv(slope)
     far = lambda off: np.nan_to_num(np.linalg.norm(off * size, axis=1), nan=np.inf)
     best, least = x, far(off)
     for _ in range(rounds):

@@ -192,19 +192,22 @@ class Chain(Ahead):
     def heavier(self, setting, options):
         """As of Ahead. What rows leave are forces over the inertia of the chain's model: the same
         forces move a lighter joint farther."""
-        out, now = super().heavier(setting, options), self._inertia(self.plain(setting))
+        out, (model, now) = super().heavier(setting, options), self._inertia(setting)
         for option in options:
             if not self.apart(option.candidate):
                 for column, values in zip(option.columns, option.base + option.directions):
                     moved = {**setting, option.candidate: tuple(values.tolist())}
-                    out[column] = self._inertia(self.plain(moved)) / now - 1
+                    out[column] = self._inertia(moved, (model, now))[1] / now - 1
         return out
 
-    def _inertia(self, setting):
-        """(nv,): diagonal of the inertia matrix under a plain setting, the mean over states."""
-        case = Case(self.model, setting, 1)
+    def _inertia(self, setting, known=None):
+        """(model, diagonal of its inertia matrix (nv,), the mean over states) of what is plain in a
+        setting; known: these of a model that may be as heavy."""
+        case = Case(self.model, self.plain(setting), 1)
         working = self.world.engine(case.structure).working
         model = working.edited(case.on, case.step)
+        if known and _as_heavy(known[0], model):
+            return known
         data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
         out, every = np.full(model.nv, 1e-300), windowing.evenly(len(self.used), POSES)
         for row in self.used[every]:
@@ -213,7 +216,7 @@ class Chain(Ahead):
             mujoco.mj_makeM(model, data)
             mujoco.mj_fullM(model, data, full)
             out += np.diag(full)
-        return out[working.v]
+        return model, out[working.v]
 
     def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""

@@ -50,15 +50,17 @@ def later(model, setting, recordings, known):
 def undone(model, setting, recording):
     """A Recording as it would be if the sensors of hinges and slides were not off, as far as that
     was measured."""
-    if not _measures(model, setting):
+    off = _measures(model, setting)
+    if not off:
         return recording
-    states = behind(model, setting, [recording], *filled(model, recording))
-    own = np.array(recording.qpos), np.array(recording.qvel)
-    for joint, (_, _, delay) in _measures(model, setting):
-        for read, state, k in zip(own, states, (joint.qposadr[0], joint.dofadr[0])):
-            gap = np.where(np.isfinite(read[:, k]), 0.0, 1.0)
-            hole = np.interp(recording.time + delay, recording.time, gap, right=1.0) > 0
-            read[:, k] = np.where(hole, np.nan, state[:, k])
+    own, given = (np.array(recording.qpos), np.array(recording.qvel)), (model, setting, [recording])
+    states = behind(*given, *filled(model, recording))
+    known = difference(model, own[0], own[0]), own[1]
+    for read, state, here, at in zip(own, states, known, ("qposadr", "dofadr")):
+        there = np.isfinite(later(*given, here))
+        for joint, _ in off:
+            k, d = getattr(joint, at)[0], joint.dofadr[0]
+            read[:, k] = np.where(there[:, d], state[:, k], np.nan)
     return replace(recording, qpos=own[0], qvel=own[1])
 
 

@@ -105,12 +105,11 @@ class Engine:
         first[:, position] -= ahead * target[:, nq + speed]
         slope = np.tile(np.eye(target.shape[1]), (len(target), 1, 1))
         moved = first + SMALL * np.eye(target.shape[1])[some][:, None]
-        change = missed(first) - missed(moved.reshape(-1, first.shape[1]), len(some)).reshape(
-            moved.shape
-        )
+        off, others = missed(first), missed(moved.reshape(-1, first.shape[1]), len(some))
+        change = off - others.reshape(moved.shape)
         slope[:, :, some] = np.nan_to_num(np.moveaxis(change, 0, -1) / SMALL)
         size = np.where(np.arange(target.shape[1]) < nq, 1.0, early[:, None])
-        best = nearest(missed, first, slope, size, SHOTS)
+        best = nearest(missed, first, off, slope, size, SHOTS)
         qpos[:, self.q], qvel[:, self.v] = best[:, :nq], best[:, nq:]
 
     def _read(self, q, v, time, step, measures):
