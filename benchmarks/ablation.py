@@ -46,7 +46,6 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "what is within the noise counts": {"diagnosis.selection.criterion:BEYOND": 0.0},
     "a member of a class is no worse, even by chance": {"diagnosis.selection.rivals:CHANCE": 1.0},
     "differences must be alike": {"diagnosis.selection.criterion:INDEPENDENT": 0.0},
-    "forward alone": {"diagnosis.selection.beam:CHANCE": 0.0},
     "no first look": {"diagnosis.selection.beam:EACH": 10**6},
     "five further effects in each first look": {"diagnosis.selection.beam:EACH": 5},
     "no force under a condition": {"diagnosis.selection.conditions:CONCENTRATED": 2.0},

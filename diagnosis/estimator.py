@@ -9,6 +9,7 @@ held-out ones are only predicted.
 
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,13 +22,7 @@ from diagnosis.recordings.recording import RecordingError
 from diagnosis.selection import missing_force, rivals, transients
 from diagnosis.selection.conditions import concentrated
 from diagnosis.selection.criterion import PRICE, complexity, paired
-from diagnosis.selection.identification import (
-    LEVEL,
-    Found,
-    Identification,
-    physics,
-    said,
-)
+from diagnosis.selection.identification import LEVEL, Found, Identification, physics, said
 from diagnosis.selection.judge import Fitted, changing, channel, lacking, share_left, without
 from diagnosis.selection.plausibility import plausible
 from diagnosis.selection.transients import Event
@@ -299,6 +294,34 @@ def _strain(candidate, values, prior):
     return f"{p.name} {values[k]:.3g} {p.unit}: {usual}"
 
 
+def _refitted(search, outcome, decides, log, some, out):
+    """The setting of some findings without one that kept-back recordings spoke against: what made
+    up for that one may be another then, which one more round finds. It may only make up for what is
+    gone, by the same recordings."""
+    found, judge = outcome.found, outcome.found.judge
+    search.candidates = [c for c in search.candidates if c is not out]
+    plain = judge.fit(some, steps=3)
+    fitted = judge.fit(search.again(plain.setting, outcome.trajectory).setting)
+    new = fitted.setting.keys() - some.keys()
+    if new and decides.worse(fitted.setting, plain.setting) > decides.scattered():
+        fitted, new = plain, ()
+    near = [c for c in fitted.setting if c in new or rivals.meet(search.world, c, out)]
+    fitted, told = _classes(search, found, fitted, log, search.candidates, near)
+    told, still = {**outcome.others, **told}, set(search.candidates) - set(fitted.setting)
+    outcome.others = {c: [o for o in told[c] if o[0] in still] for c in told}
+    return _earned(search, judge, fitted).setting  # what was earned beside it goes, too
+
+
+def _nearest(judge, outcome, decides):
+    """The setting of a curve that the force at a joint follows, where a Check says that it predicts
+    better than the nominal model by more than noise does; None where there is none."""
+    for rest in missing_force.each_joint(outcome.dependences)[:2]:
+        setting = judge.fit({rest.candidate: rest.values}, steps=2).setting
+        if decides.worse({}, setting) > decides.scattered():
+            return setting
+    return None
+
+
 def _hand_over(search, held, kept_back, outcome, log):
     """Fill in the Handed, what of the findings kept-back recordings do not speak against, and how
     sure of each the judge is."""
@@ -307,24 +330,12 @@ def _hand_over(search, held, kept_back, outcome, log):
     check = decides = Check(world, held, Smoother(world, held), noise)
     if kept_back is not held:
         decides = Check(world, kept_back, Smoother(world, kept_back), noise)
-    judge = found.judge
-
-    pool = list(search.candidates)
-
-    def refit(some, out):  # what made up for a finding that goes may be another then
-        pool[:] = [c for c in pool if c is not out]
-        near = [c for c in some if rivals.meet(world, c, out)]
-        plain = judge.fit(some, steps=3)
-        fitted, told = _classes(search, found, plain, log, pool, near)
-        swapped = fitted.setting.keys() != plain.setting.keys()
-        # what takes another's place may only make up for what is gone
-        if swapped and decides.worse(fitted.setting, plain.setting) > decides.scattered():
-            fitted, told = plain, {}
-        told, still = {**outcome.others, **told}, set(pool) - set(fitted.setting)
-        outcome.others = {c: [o for o in told[c] if o[0] in still] for c in told}
-        return _earned(search, judge, fitted).setting  # what was earned beside it goes, too
-
+    judge, refit = found.judge, partial(_refitted, search, outcome, decides, log)
     outcome.handed = accepted(world, decides, setting, refit, log, told=check)
+    curve = None if physics(outcome.handed.setting) else _nearest(judge, outcome, decides)
+    if curve:
+        handed = accepted(world, decides, curve, log=log, told=check)
+        outcome.handed = replace(handed, gone=outcome.handed.gone)
     kept = outcome.handed.setting
     if kept != setting:
         outcome.fitted = judge.fit(kept, steps=0)

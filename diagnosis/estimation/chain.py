@@ -13,12 +13,10 @@ import mujoco
 import numpy as np
 
 from diagnosis.estimation import windowing
-from diagnosis.estimation.ahead import GROUPS, Ahead, with_own_step
+from diagnosis.estimation.ahead import Ahead, with_own_step
 from diagnosis.simulation.rows import RowMap, coarse
 from diagnosis.simulation.simulator import Case
 
-GROUPED = 19  # rows in each group, in which forces are compared
-OUTSIDE = 0.1  # share of a located force that may hang by rows outside of the windows
 # fields of a model that its inertia hangs by
 INERTIAL = (
     "body_mass body_inertia body_ipos body_iquat body_pos dof_armature tendon_armature".split()
@@ -62,7 +60,6 @@ class Chain(Ahead):
         rough = self._rows({**self.coarse, **self.base}, self.begin)
         self.inertia = self.map.model
         self.finer, self.beyond = self._rows({**step, **self.base}, self.begin) - rough, {}
-        self.told, self.located = None, {}
         self.contacts = self._begun([self.windows[i] for i in self.touched], touching)
         self.travel = np.where(touched[:, None, None], self.whole.travel, np.inf)
 
@@ -129,48 +126,12 @@ class Chain(Ahead):
             out[:, t + 1] = np.where(self.known[:, t + 1, :, None], x[:, :nv], 0.0)
         return out
 
-    def telling(self):
-        """Rows in which located forces are compared, from now on along with every prediction:
-        those whose force hangs by what happens in the rows used, as many in each group."""
-        if self.told is None:
-            t = self.trajectory
-            outside = ~t.free
-            outside[self.begin] = False
-            beyond = t.response(t.driven * outside[:, None, None])
-            some = self.used[abs(beyond[self.used]).max((1, 2)) < OUTSIDE]
-            some = some[windowing.evenly(len(some), GROUPS * GROUPED)]
-            self.told = some[: len(some) // GROUPS * GROUPS]
-            self.lacks = self.missing(self.base, self.used)
-        return self.told
-
     def _along(self, settings, out):
         """Fill in what the chain predicts, the same once."""
         keys = [frozenset(setting.items()) for setting in settings]
         done = {key: self.missing(s, self.used) for key, s in dict(zip(keys, settings)).items()}
-        if self.told is not None:
-            self._locate({key: m for key, m in done.items() if key not in self.located})
         grown = {key: self._grown(missing) for key, missing in done.items()}
         out[:] = [grown[key] for key in keys]
-
-    def _locate(self, every):
-        """Remember what smoothing would locate of {key: what is missing in the rows used}."""
-        if not every:
-            return
-        t = self.trajectory
-        less = np.stack([*every.values()], -1) - self.lacks[..., None]
-        change = np.zeros((len(t.qvel), *less.shape[1:]), np.float32)
-        change[self.used] = np.where(np.isfinite(less), less, 0.0)
-        force = t.force[self.told][..., None] + t.response(change)[self.told]
-        self.located |= dict(zip(every, np.moveaxis(force, -1, 0)))
-
-    def lacking(self, settings):
-        """(rows, nv, settings): generalized force that settings lack in the rows that tell, as the
-        smoother locates it."""
-        plain = [self.plain(setting) for setting in settings]
-        keys = [frozenset(setting.items()) for setting in plain]
-        new = {key: p for key, p in zip(keys, plain) if key not in self.located}
-        self._locate({key: self.missing(p, self.used) for key, p in new.items()})
-        return np.stack([self.located[key] for key in keys], -1)
 
     def _beyond(self, settings, plain, out):
         """Add what effects do that are more than what happens within a row, beside the setting that

@@ -1,5 +1,4 @@
-"""A Kalman smoother over many blocks of rows at once, with the scores of its variances, and what it
-makes of changes in the rows.
+"""A Kalman smoother over many blocks of rows at once, with the scores of its variances.
 
 Per block: x' = A x + c + noise of variance Q, y = x[:m] + noise of variance R; see Durbin and
 Koopman, Time Series Analysis by State Space Methods, sections 4.4 and 7.3 (disturbance smoother).
@@ -16,16 +15,13 @@ ROUNDING = 1e-12  # share added to variances: noise far smaller than these would
 class Smoothed:
     """state (T, blocks, n), variance (T, blocks, n) of each component; for the variances' updates
     process, measurement: pairs (sum of squares, what that would be at the likelihood's optimum),
-    (n,) or (m,). gains, what is done with errors: (transition (T, blocks, n, n); what measuring
-    leaves (T, blocks, n, n); precision (T, blocks, m, m) of measured less predicted, 0 of what is
-    not measured; variance (T, blocks, n, n) of predicted states).
+    (n,) or (m,).
     """
 
     state: np.ndarray
     variance: np.ndarray
     process: tuple
     measurement: tuple
-    gains: tuple
 
 
 def smooth(A, c, Q, y, R, start, spread, counts=None):
@@ -50,7 +46,7 @@ def smooth(A, c, Q, y, R, start, spread, counts=None):
     u = pushed - _times(np.swapaxes(K, -1, -2), behind)
     told = known if counts is None else known & counts[..., None]
     measurement = (u**2 * told).sum((0, 1)), (D * told).sum((0, 1))
-    return Smoothed(state, np.maximum(variance, 0.0), process, measurement, (A, keep, Finv, P))
+    return Smoothed(state, np.maximum(variance, 0.0), process, measurement)
 
 
 def _backward(A, keep, pushed, P, K, Finv):
@@ -100,33 +96,3 @@ def _forward(A, c, Q, y, known, R, start, spread):
         P[:, range(n), range(n)] += Q[t]
         P = (P + np.swapaxes(P, -1, -2)) / 2
     return xs, Ps, gains, inverses * pair, errors
-
-
-class Response:
-    """The force that a smoother would locate more of what happens in the rows, for what a located
-    force is compared with goes through the same filter: smooth, and less the noisier positions are.
-    """
-
-    def __init__(self, gains, index, own):
-        """gains: of a Smoothed of states (positions, velocities, forces); index (T, blocks): rows
-        of its blocks; own (T, blocks): which of them are taken from a block."""
-        A, keep, precision, variance = gains
-        self.index, self.own = index, own
-        force = variance[..., precision.shape[-1] :, :]  # (T, blocks, nv, n)
-        self.onward, self.precision, self.force = map(np.float32, (A @ keep, precision, force))
-
-    def __call__(self, change):
-        """(rows, nv, k), where in every row the motion changes by change (rows, 2 nv, k) more until
-        the next one, of which the model knows nothing."""
-        (T, blocks, n), (rows, m, k) = self.onward.shape[:3], change.shape
-        error = np.zeros((T, blocks, n, k), np.float32)
-        for t in range(T - 1):
-            error[t + 1] = self.onward[t] @ error[t]
-            error[t + 1, :, :m] += change[self.index[t]]
-        out, back = np.zeros((rows, n - m, k)), np.zeros_like(error[0])
-        for t in range(T - 1, -1, -1):
-            back = self.onward[t].transpose(0, 2, 1) @ back
-            back[:, :m] += self.precision[t] @ error[t, :, :m]
-            own, located = self.own[t], self.force[t] @ back - error[t, :, m:]
-            out[self.index[t, own]] = located[own]
-        return out

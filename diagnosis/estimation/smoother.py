@@ -20,7 +20,7 @@ import numpy as np
 from diagnosis.effects.base import HINGE, SLIDE
 from diagnosis.effects.environment import collides
 from diagnosis.estimation import windowing
-from diagnosis.estimation.kalman import Response, smooth
+from diagnosis.estimation.kalman import smooth
 from diagnosis.estimation.readings import behind, later, measurement_noise, shown
 from diagnosis.simulation.rows import RowMap
 
@@ -42,7 +42,7 @@ class Trajectory:
     that follows; qpos_sd, qvel_sd, force_sd (rows, nv); first: {recording: its first row}; free
     (rows,): where something touches, and no force is told; transition (rows, 2 nv, 2 nv): to the
     next row, of small changes; step: the simulator's, s, 0 if unknown; driven (rows, 2 nv, nv): by
-    forces, None if unknown; response: the Response by which the force was located, None if unknown.
+    forces, None if unknown.
     """
 
     qpos: np.ndarray
@@ -56,7 +56,6 @@ class Trajectory:
     transition: np.ndarray
     step: float = 0.0
     driven: np.ndarray = None
-    response: Response = None
 
     def at(self, windows):
         """Start states of windows: qpos (W, nq), qvel (W, nv)."""
@@ -186,7 +185,7 @@ class Smoother:
         transition[~self.last] = step[0][:, : 2 * nv]
         split = np.split(transition, [2 * nv], axis=2)
         args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
-        return Trajectory(*args, Response(found.gains, self.index, self.own))
+        return Trajectory(*args)
 
     def _linear(self, rows, qpos, qvel, force, free, like):
         """(A, c, extra, seconds) of every row that has a next one: transitions of (q, v, w) about a

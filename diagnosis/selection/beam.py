@@ -16,7 +16,6 @@ from diagnosis.selection.plausibility import cost
 
 WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in each in full
 DEPTH = 4  # effects added in one round
-CHANCE = 0.05  # that forces speak against an effect by accident
 LEAST = 0.01  # loss that an effect must remove in the search
 GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
 MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; new ones in each
@@ -30,17 +29,13 @@ class Node:
     score: Score
     unpriced: float  # what the search goes by: a price paid early hides what two do together
     loss: float  # with the price of its complexity, what sets are ranked by
-    lacks: Score  # of the missing force, if that is asked
 
 
 class Beam:
     """Looks for sets of options that lower the loss, with priors and the price of complexity."""
 
-    def __init__(self, columns, evidence, missing=None):
-        """missing: a MissingForce, which may not speak against whatever joins a set."""
+    def __init__(self, columns, evidence):
         self.columns, self.evidence, self.known = columns, evidence, {}
-        asked = missing and len(missing.rows)
-        self.missing = missing.evidence(columns.options) if asked else None
         inside = columns.setting
         self.kept = tuple(k for k, o in enumerate(columns.options) if o.candidate in inside)
         self.free = [k for k, o in enumerate(columns.options) if o.candidate not in inside]
@@ -52,54 +47,42 @@ class Beam:
         options = self.columns.options
         self.free = [k for k in self.free if options[k].candidate not in candidates]
 
-    def node(self, options, by=None):
-        """The Node of some options, as nodes_of() takes them."""
-        return self.nodes_of([options], by)[0]
+    def node(self, options):
+        """The Node of some options, those kept included."""
+        return self.nodes_of([options])[0]
 
-    def nodes_of(self, sets, by=None):
-        """The Nodes of some sets of options (those kept included); by: the Evidence that they are
-        fitted to, if not that of the motion."""
-        evidence, keys = by or self.evidence, [(by is None, tuple(sorted(each))) for each in sets]
+    def nodes_of(self, sets):
+        """The Nodes of some sets of options."""
+        keys = [tuple(sorted(each)) for each in sets]
         new = {k: tuple(options) for k, options in zip(keys, sets) if k not in self.known}
         given = [self._problem(options) for options in new.values()]
-        for key, (index, *_), score in zip(new, given, evidence.scores(given)):
-            self.known[key] = self._node(new[key], index, score, evidence)
+        for key, score in zip(new, self.evidence.scores(given)):
+            self.known[key] = self._node(new[key], score)
         return [self.known[k] for k in keys]
 
     def _problem(self, options):
         return problem(self.columns, options, [k for k in self.kept if k not in options])
 
-    def _node(self, options, index, score, evidence):
-        """The Node of options, of columns index, with a Score by an Evidence."""
+    def _node(self, options, score):
+        """The Node of options with a Score."""
         setting = moved_setting(self.columns, score.amounts, options)
         chosen = [self.columns.options[k] for k in options]
         nats = sum(cost(o.candidate, setting[o.candidate], o.prior) for o in chosen)
-        unpriced = score.loss + nats / evidence.number
+        unpriced = score.loss + nats / self.evidence.number
         loss = unpriced + PRICE * complexity(o.candidate for o in chosen)
-        asked = self.missing and evidence is self.evidence
-        lacks = self.missing.at(index, score.amounts) if asked else None
-        return Node(options, score, unpriced, loss, lacks)
-
-    def _against(self, node, new):
-        """Whether what joined a node explains the motion, but by forces that speak against it."""
-        return self.missing and paired(new.lacks, node.lacks).p_value < CHANCE
+        return Node(options, score, unpriced, loss)
 
     def nodes(self):
         """(node of the model as it is, all nodes met, best first)."""
         start = self.node(self.kept)
         met, beam, before = {start: None}, [start], np.inf
-        proposed = self._proposed(start)
-        if proposed is not start and not self._against(start, proposed):
-            met[proposed] = None
-            beam.append(proposed)
-            self._reduced(proposed, start, met)
         for _ in range(DEPTH):
             grown, each = [new for node in beam for new in self._joined(node, met)], {}
             for node in sorted(grown, key=lambda n: n.unpriced):
                 each.setdefault(self._candidates(node), node)
             beam = list(each.values())[:WIDTH]  # the best of each set of candidates
             for node in beam:
-                self._reduced(node, start, met)
+                self._reduced(node, met)
             best = min(node.loss for node in met)
             if best >= before:
                 break
@@ -117,35 +100,19 @@ class Beam:
         return list(best.values())
 
     def _joined(self, node, met):
-        """[Node] of sets with one effect more than a node that are better; those that the missing
-        force does not speak against are met."""
+        """[Node] of sets with one effect more than a node that are better; all are met."""
         # first every option in full: what lowers squares most is not what lowers their logarithm
         # most, and what comes first decides what is tried beside it
         first = node.options == self.kept
         grown = []
         further = self.free if first else self._looks(node)
         for k, new in zip(further, self.nodes_of([(*node.options, k) for k in further])):
-            if self._against(node, new):
-                continue
             met[new] = None
             # of two that make up for each other neither is better alone
             better = first or new.unpriced < node.unpriced - LEAST
             if better and not self._unnamed(k):
                 grown.append(new)
         return grown
-
-    def _proposed(self, start):
-        """The Node of what the missing force alone would choose, one effect after the other: where
-        many joints lack something, that is more than what a few steps along the motion add."""
-        if not self.missing:
-            return start
-        best, grown = None, [self.node(start.options, self.missing)]
-        while grown and (best is None or grown[0].loss < best.loss - LEAST):
-            best = grown[0]
-            named = [k for k in self.others(best) if not self._unnamed(k)]
-            grown = self.nodes_of([(*best.options, k) for k in named], self.missing)
-            grown.sort(key=lambda n: n.loss)
-        return self.node(best.options)
 
     def _unnamed(self, k):
         """Whether an option is a curve: it leaves so little that what stands beside it would fill
@@ -155,15 +122,13 @@ class Beam:
     def _candidates(self, node):
         return frozenset(self.columns.options[k].candidate for k in node.options)
 
-    def _reduced(self, node, start, met):
+    def _reduced(self, node, met):
         """Meet the sets that are left when effects go again, those of the model too, the one that
         is missed least first, as long as that is better."""
         while len(node.options) > 1:
-            goes, fewer = [k for k in node.options if k not in self.stay], []
-            for less in self.nodes_of([[k for k in node.options if k != out] for out in goes]):
-                if not self._against(start, less):
-                    met[less] = None
-                    fewer.append(less)
+            goes = [k for k in node.options if k not in self.stay]
+            fewer = self.nodes_of([[k for k in node.options if k != out] for out in goes])
+            met.update(dict.fromkeys(fewer))
             less = min(fewer, key=lambda n: n.loss, default=node)
             if less.loss >= node.loss:
                 break
@@ -176,9 +141,9 @@ class Beam:
 
     def gains(self, node):
         """{k: nats} that options of effects which a node does not hold promise, in a first look."""
-        index, *_, precision, _ = self._problem(node.options)
         low, high = map(np.concatenate, zip(*((o.low, o.high) for o in self.columns.options)))
-        gain = self.evidence.looks(index, node.score.amounts, precision, low, high)
+        given = self._problem(node.options)
+        gain = self.evidence.looks(given, node.score.amounts, low, high)
         return {k: gain[list(self.columns.options[k].columns)].sum() for k in self.others(node)}
 
     def _looks(self, node):

@@ -234,7 +234,8 @@ class Evidence:
         squares = self.square_of(products, bounded(matrix, vector, low, high))
         # of a heavier joint it is left out: noise in torques would speak for it
         inertia = 1 + np.einsum("bp,bpc->bc", amounts, self.heavier[columns])
-        squares = squares / np.clip(inertia, LIGHTEST, 1.0)[:, None] ** 2
+        more = np.clip(inertia, LIGHTEST, 1.0)[:, None] ** -2 - 1
+        squares = squares + more * np.maximum(squares - self.noise**2, 0.0)
         return [self._scored(*self._logs(square), own) for square, own in zip(squares, amounts)]
 
     def _fitted(self, products, prior):
@@ -268,9 +269,11 @@ class Evidence:
         each = 1 / (np.maximum(self.count, 1) * (square + self.floor))
         return np.where(self.count > 0, each, 0.0)
 
-    def looks(self, columns, amounts, precision, low, high):
+    def looks(self, given, amounts, low, high):
         """In-sample gain (K,) in nats of each further column, between bounds (K,) of its amount,
-        beside some at their amounts: a first look."""
+        beside some, given as score() takes them, that move along from amounts (p,): a first
+        look."""
+        columns, *bounds, precision, pull = given
         index, sums = np.concatenate([[0], np.asarray(columns, int) + 1]), self.sums
         square = self.squares(columns, np.asarray(amounts, float))
         weight = self.group.T @ self.weighed(square)  # (W, cells)
@@ -284,13 +287,16 @@ class Evidence:
         beside -= np.einsum("wik,wip->kp", moved, taken[..., index])
         own = np.einsum("kn,n,kn->k", sums.columns, row, sums.columns)
         own = (own - 2 * np.einsum("wik,wik->k", taken, moved))[1:]
-        inside = beside[index[1:], 1:] + np.diag(precision)
-        score = beside[1:, 0] - beside[1:, 1:] @ amounts
-        curve = own.copy()
-        if len(index) > 1:
-            cross = beside[1:, 1:]
-            inside += 1e-9 * np.diag(np.diag(inside))  # of two columns that are the same
-            curve -= (cross * np.linalg.solve(inside, cross.T).T).sum(1)
+        score, cross = beside[1:, 0] - beside[1:, 1:] @ amounts, beside[1:, 1:]
+        # the least squares of these weights are not quite where the amounts are
+        steep = score[index[1:] - 1] + pull - precision * amounts
+        stuck = [(amounts <= bounds[0]) & (steep <= 0), (amounts >= bounds[1]) & (steep >= 0)]
+        goes = np.flatnonzero(~np.logical_or(*stuck))
+        inside = cross[index[1:] - 1] + np.diag(precision)
+        inside += 1e-9 * np.diag(np.diag(inside))  # of two columns that are the same
+        share = np.linalg.solve(inside[np.ix_(goes, goes)], cross[:, goes].T).T
+        score = score - share @ steep[goes]
+        curve = own - (share * cross[:, goes]).sum(1)
         seen = curve > 1e-9 * np.maximum(own, 1e-300)
         amount = np.clip(score / np.where(seen, curve, np.inf), low, high)
         return np.where(seen, amount * (score - amount * curve / 2), 0.0)

@@ -66,7 +66,7 @@ class Identification:
         for i in range(ROUNDS):
             judge = self.begin(setting, trajectory)
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
-            fitted = self._round(setting, judge)
+            fitted = self._round(setting, judge, self._curves(setting))
             if fitted.setting.keys() == setting.keys():
                 break
             setting = fitted.setting
@@ -78,6 +78,12 @@ class Identification:
             self.sets = carried(judge, self.sets, fitted, fitted)
         known = trajectory, first, self.smoother, self.usual, judge
         return Found(fitted, *known, self.missing, self.ranking, self.sets)
+
+    def again(self, setting, trajectory):
+        """The Fitted set of one more round, without curves, from a setting and a trajectory of one
+        like it."""
+        trajectory, self.sets = self.smoother.locate(setting, trajectory, passes=1), []
+        return self._round(setting, self.begin(setting, trajectory), [])
 
     def locate(self, setting):
         """(trajectory under a setting, trajectory under the nominal model), by which the windows
@@ -108,10 +114,10 @@ class Identification:
         ahead.start(copy(self.smoother).locate(setting, self.trajectory, passes=2), setting)
         return Judge(ahead, self.usual, judge.reference, self.seen)
 
-    def _round(self, setting, judge):
-        """The Fitted set that a round ends with."""
+    def _round(self, setting, judge, curves):
+        """The Fitted set that a round ends with; curves: [(candidate, values)] that compete."""
         others = [c for c in self.candidates if c not in setting]
-        every, curves = [*setting, *others], self._curves(setting)
+        every = [*setting, *others]
         known = self.usual, self.seen, self.trajectory, self.screen.touches
         starts = Starts(self.world, setting, *known)
         self.missing = missing = MissingForce(self.screen, setting, self.missing)
@@ -124,7 +130,7 @@ class Identification:
         columns.nearer(nominal, tried)
         evidence = columns.evidence(nominal)
         self.looked = max(evidence.different(), 1.0)
-        beam, now = Beam(columns, evidence, missing), judge.fit(setting)
+        beam, now = Beam(columns, evidence), judge.fit(setting)
         self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; {now.loss:.3f}")
         self.ranking = self.ranking or beam.ranking()  # of the first look of all
         judged = self._judged(judge, beam, now)

@@ -1,17 +1,12 @@
-"""The other direction: the force that the simulator lacks along the measured motion, what of it
-effects hold, and what it depends on where no name holds it.
+"""The force that the simulator lacks along the measured motion, what of it effects hold, and what
+it depends on where no name holds it.
 
 missing = MissingForce(chain, setting)
 missing.basis(start)                    # (rows, dofs, p): what a Start holds of it
-missing.evidence(starts).at([0], [0.1]) # the criterion's Score of what is lacking beside them
-missing.scores({}, {friction: (0.1,)}) # the Scores of what settings lack
 for found in dependences(world, trajectory, recordings): found.joint, found.candidate
-
-Errors in what a model is given pass for physics in predictions or in this, but not in both.
 """
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -19,9 +14,9 @@ from diagnosis.effects.base import HINGE, SLIDE
 from diagnosis.effects.drives import drives_of
 from diagnosis.effects.unmodelled import asked, reader
 from diagnosis.estimation import windowing
-from diagnosis.estimation.ahead import GROUPS
-from diagnosis.selection.criterion import Evidence
 
+ROWS = 300  # in which forces are looked at, at most
+STICKS = 0.1  # of the usual effect of a force on a joint, below which it sticks in a row
 ODD = 5.0  # of its usual size, beyond which what is missing in a row counts no more
 SMALLEST = 0.05  # of its RMS, that its usual size is taken to be
 FINE, KNOTS = 33, 9  # places over the range where a curve may bend, and values that it has at most
@@ -38,28 +33,28 @@ CLIP = 5.0  # of the usual size, beyond which a located force counts no more
 
 class MissingForce:
     """In rows of a Chain where nothing touches, under a setting. force (n, nv), in units of what is
-    usual in each dof; noise (nv,): how well that is known; rows (n,): those of the Chain in which
-    forces are compared, as many in each group."""
+    usual in each dof; rows (n,): those of the Chain that are looked at."""
 
     def __init__(self, chain, setting, before=None):
         """before: a MissingForce in the same rows, from which what effects do there that neither
         setting has is taken over: a motion that is located anew hardly moves."""
-        self.chain, self.setting = chain, setting
-        self.rows, self.done = chain.telling(), {}
-        self.seen, self.plain = np.isfinite(chain.noise), chain.plain(setting)
-        self.force, self.noise = chain.lacking([setting])[..., 0], np.full(chain.model.nv, np.inf)
+        self.chain, self.setting, self.plain = chain, setting, chain.plain(setting)
+        self.rows = chain.used[windowing.evenly(len(chain.used), ROWS)]
+        self.done, t = {}, chain.trajectory
         if before and np.array_equal(before.rows, self.rows):
             known, inside = before.done.items(), {*setting, *before.setting}
             self.done = {key: done for key, done in known if key[0] not in inside}
         if len(self.rows):
-            size = 1.4826 * np.median(abs(self.force), 0) + SMALLEST * rms(self.force) + 1e-12
-            self.weight = np.where(self.seen, 1 / np.maximum(size, abs(self.force) / ODD), 0.0)
-            self.force = self.force * self.weight
-            sd = rms(chain.trajectory.force_sd[self.rows] * self.weight)
-            self.noise = np.where(self.seen, sd, np.inf)
-            # a joint that sticks obeys no force
-            self.obeyed = np.linalg.pinv(chain.trajectory.driven[self.rows, chain.model.nv :])
+            driven = t.driven[self.rows, chain.model.nv :]
+            size = np.linalg.norm(driven, axis=1)
+            sticks = size < STICKS * rms(size)  # a joint that sticks obeys no force
+            self.obeyed = np.where(sticks[..., None], 0.0, np.linalg.pinv(driven))
             self.whole = self._pushed(self.plain)
+            force = t.force[self.rows] + self.whole - self._pushed(chain.base)
+            size = 1.4826 * np.median(abs(force), 0) + SMALLEST * rms(force) + 1e-12
+            seen = np.isfinite(chain.noise)
+            self.weight = np.where(seen, 1 / np.maximum(size, abs(force) / ODD), 0.0)
+            self.force = force * self.weight
 
     def _pushed(self, plain):
         """Generalized force (n, nv) that a plain setting lacks in each row, as it is."""
@@ -88,39 +83,6 @@ class MissingForce:
         if place.kind not in ("joint", "actuator") or joints is None:
             return np.ones(model.nv, bool)
         return np.isin(model.dof_jntid, list(joints))
-
-    def evidence(self, starts):
-        """The Evidence of the force and of what Starts hold of it, all their directions in turn,
-        as the smoother would locate that."""
-        none = lambda start: np.zeros((*self.force.shape, len(start.directions)))
-        apart = lambda start: self.chain.apart(start.candidate)  # no row tells
-        held = lambda start: self._held(start.settings(self.setting))
-        return self._evidence(none(start) if apart(start) else held(start) for start in starts)
-
-    def _held(self, settings):
-        """(n, nv, settings): what each of them holds of the force."""
-        return self.force[..., None] - self.chain.lacking(settings) * self.weight[..., None]
-
-    def _evidence(self, held):
-        """Of the force and what is held of it, [(n, nv, p)]."""
-        every = np.concatenate([self.force[..., None], *held], -1)
-        every = every.reshape(GROUPS, len(every) // GROUPS, *every.shape[1:])
-        groups = SimpleNamespace(  # as the windows of an Ahead that knows their states
-            known=np.broadcast_to(self.seen, every.shape[:3]),
-            band=np.zeros(every.shape[:2], int),
-            group=np.arange(GROUPS),
-            channels=self.chain.channels,
-            noise=self.noise,
-            freedom=lambda: np.zeros((*every.shape[:3], 0)),
-        )
-        return Evidence(groups, every[..., 0], every[..., 1:])
-
-    def scores(self, *settings):
-        """[Score] of the force that settings lack, or None where no row tells."""
-        if not len(self.rows):
-            return None
-        evidence = self._evidence([self._held(settings)])
-        return [evidence.at([k], np.ones(1)) for k in range(len(settings))]
 
 
 def rms(x):

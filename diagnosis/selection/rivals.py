@@ -107,8 +107,7 @@ def _along(chain, judge, setting):
 
 def _members(candidates, judge, before, fitted, candidate, held):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
-    their price, best first, and against which the missing force does not speak. held: Columns of
-    the Fitted set."""
+    their price, best first. held: Columns of the Fitted set."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting]
     missing, out = MissingForce(before.chain, rest, before), []
@@ -123,11 +122,7 @@ def _members(candidates, judge, before, fitted, candidate, held):
         tried = judge.fit({**rest, other: values}, steps=2, near=fitted)
         if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
             continue
-        tried = judge.fit(tried.setting, near=tried)  # forces tell values better than the motion
-        apart = before.chain.apart(other) or before.chain.apart(candidate)
-        lacks = None if apart else missing.scores(tried.setting, fitted.setting)
-        if lacks is None or _tied(*lacks):
-            out.append((tried, other))
+        out.append((judge.fit(tried.setting, near=tried), other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 HORIZON = 0.3  # s
+FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
 
 def windows(time, horizon=HORIZON):
@@ -79,6 +80,7 @@ def model_residuals(nominal, model, runs, noise, horizon=HORIZON, step=None, shi
     out, length = [], model.opt.timestep
     for run in runs:
         data = mujoco.MjData(model)
+        _hold(model, data, drives, run.ctrl[0])
         spans = windows(run.time, horizon)
         starts = {first for first, _ in spans}
         end = max((last for _, last in spans), default=0)
@@ -103,6 +105,22 @@ def model_residuals(nominal, model, runs, noise, horizon=HORIZON, step=None, shi
                         step(model, data)
     model.opt.timestep = length
     return np.array(out).reshape(-1, nominal.nv)
+
+
+def _hold(model, data, drives, ctrl):
+    """What waits and what filters begins as after the first control (nu,) that was recorded, held
+    for long: a recording does not tell what was before."""
+    data.ctrl[drives] = ctrl
+    for drive in drives:
+        u = model.actuator_ctrladr[drive]
+        limits = model.actuator_ctrlrange[u] if model.actuator_ctrllimited[u] else (-np.inf, np.inf)
+        value = np.clip(data.ctrl[u], *limits)
+        if model.actuator_delay[drive] > 0:
+            count = model.actuator_history[drive, 0]
+            past = -model.opt.timestep * np.arange(count, 0, -1)
+            mujoco.mj_initCtrlHistory(model, data, drive, past, np.full(count, value))
+        if model.actuator_dyntype[drive] in FILTERS:
+            data.act[model.actuator_actadr[drive]] = value
 
 
 def system_error(system, runs, noise, perfect=False, kept=None):

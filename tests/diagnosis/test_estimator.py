@@ -292,3 +292,43 @@ def test_an_event_removes_error_where_it_is_and_has_a_value(
     assert (event is not None) == told
     if told:
         assert event.removed == removed and event.candidate is mass
+
+
+@pytest.mark.parametrize("worse, kept", [(-5.0, {"gain", "friction"}), (2.0, {"gain"})])
+def test_what_made_up_for_a_finding_that_goes_may_be_another_by_the_same_recordings(
+    monkeypatch, worse, kept
+):
+    fit = lambda setting, steps=0: Set(setting=dict(setting))
+    asked = []
+    again = lambda setting, trajectory: Set(setting={**setting, "friction": 0.1})
+    search = SimpleNamespace(candidates=["gain", "friction", "delay"], again=again, world=None)
+    found = SimpleNamespace(judge=SimpleNamespace(fit=fit))
+    others = {"gain": [("delay", 0.02)]}
+    outcome = SimpleNamespace(found=found, trajectory=None, others=others)
+    decides = SimpleNamespace(worse=lambda new, plain: worse, scattered=lambda: 1.0)
+
+    def classes(search, found, fitted, log, candidates, near):
+        asked.extend(near)
+        return fitted, {c: [] for c in near}
+
+    monkeypatch.setattr(estimator, "_classes", classes)
+    monkeypatch.setattr(estimator, "_earned", lambda search, judge, fitted: fitted)
+    monkeypatch.setattr(estimator.rivals, "meet", lambda world, c, out: False)
+    setting = estimator._refitted(search, outcome, decides, None, {"gain": 0.8}, "delay")
+    assert set(setting) == kept and set(asked) == kept - {"gain"}
+    assert "delay" not in search.candidates  # no more, nor as what a finding may be
+    assert outcome.others["gain"] == []
+
+
+@pytest.mark.parametrize("better, chosen", [((2.0, 9.0), "first"), ((0.5, 9.0), "second")])
+def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(better, chosen):
+    names = "first", "second", "third"
+    left = [SimpleNamespace(joint=n, candidate=n, values=(1.0,)) for n in names]
+    judge = SimpleNamespace(fit=lambda setting, steps: Set(setting=setting))
+    gains = dict(zip(names, (*better, 99.0)))
+    worse = lambda nominal, setting: gains[min(setting)]
+    decides = SimpleNamespace(worse=worse, scattered=lambda: 1.0)
+    outcome = SimpleNamespace(dependences=left)
+    assert estimator._nearest(judge, outcome, decides) == {chosen: (1.0,)}
+    gains |= dict.fromkeys(names[:2], 0.5)  # the third joint is not asked
+    assert estimator._nearest(judge, outcome, decides) is None

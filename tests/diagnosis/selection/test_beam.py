@@ -140,33 +140,3 @@ def test_what_made_up_for_an_effect_goes_when_that_joins(limit):
     assert setting["true"] == pytest.approx((1.0,), rel=0.05)
     if not limit:  # a further look is taken at what is left without it
         assert beam.gains(nodes[0]).keys() <= {0}
-
-
-def test_what_many_joints_lack_is_met_at_once_where_the_missing_force_shows_it(monkeypatch):
-    monkeypatch.setattr(beam_module, "DEPTH", 1)
-    rng, ahead = np.random.default_rng(4), scene(channels=6)
-    every = clustered(rng, ahead, share=0.0)
-    named = {f"joint {k}": every * (np.arange(6) == k) for k in range(6)}
-    named["mimic"] = clustered(rng, ahead, share=0.0)
-    residual = every + 0.1 * clustered(rng, ahead, share=0.0)
-    alone, _ = made(named, residual, ahead)
-    assert max(len(node.options) for node in alone.nodes()[1]) == 1
-    force = SimpleNamespace(rows=[0], evidence=lambda options: alone.evidence)
-    beam = Beam(alone.columns, alone.evidence, force)
-    assert set(beam.nodes()[1][0].options) == set(range(6))
-    # but the motion judges it: what that does not need goes again
-    motion, names = made(named, named["joint 0"] + 0.001 * residual, ahead)
-    best = Beam(motion.columns, motion.evidence, force).nodes()[1][0]
-    assert names(best) == {"joint 0"}
-
-
-def test_what_forces_speak_against_is_not_met_however_well_it_predicts():
-    rng, ahead = np.random.default_rng(5), scene()
-    whole, rest, other = (clustered(rng, ahead, share=0.0) for _ in range(3))
-    columns = {"right": whole + 0.3 * rest, "mimic": whole + 0.1 * other}
-    motion, names = made(columns, whole, ahead)
-    assert "mimic" in names(motion.nodes()[1][0])
-    force, _ = made({"right": whole + 0.1 * rest, "mimic": -0.5 * whole}, whole, ahead)
-    located = SimpleNamespace(rows=[0], evidence=lambda options: force.evidence)
-    met = Beam(motion.columns, motion.evidence, located).nodes()[1]
-    assert names(met[0]) == {"right"} and not any("mimic" in names(node) for node in met)

@@ -225,34 +225,54 @@ def test_start_states_do_not_follow_what_is_far_beyond_what_is_known_of_them():
     assert np.sqrt(square.mean() / np.mean(residual**2)) > 0.3
 
 
+def nothing_bounds(p):
+    """Bounds far away and a prior of no weight, of p columns, as score() takes them."""
+    return np.full(p, -99.0), np.full(p, 99.0), np.zeros(p), np.zeros(p)
+
+
 @pytest.mark.parametrize("moves", [False, True])
-def test_a_first_look_is_the_gain_of_least_squares(moves):
+@pytest.mark.parametrize("share", [1.0, 0.8])
+def test_a_first_look_is_the_gain_of_least_squares(moves, share):
+    """Also where the amounts are not those of least squares."""
     rng = np.random.default_rng(5)
     ahead = scene(channels=1 if moves else 2, begun=begun(rng) if moves else None)
     columns, residual = clustered(rng, ahead, (4,)), clustered(rng, ahead)
+    columns[..., 3] = 2 * columns[..., 1] + 1e-7 * columns[..., 0]  # tells nothing more
     evidence = evidence_of(ahead, residual, columns)
-    start = free(evidence, (1,))
-    far = np.full(4, 99.0)
-    gains = evidence.looks((1,), start.amounts, np.zeros(1), -far, far)
-    weight = evidence.weighed(evidence.squares((1,), start.amounts))
+    amounts, far = share * free(evidence, (1,)).amounts, np.full(4, 99.0)
+    gains = evidence.looks(((1,), *nothing_bounds(1)), amounts, -far, far)
+    weight = evidence.weighed(evidence.squares((1,), amounts))
     rows = np.sqrt(weight[ahead.group])[:, None, :] * np.ones(ahead.known.shape)
     if moves:
-        every = np.array([0.0, start.amounts[0], 0.0, 0.0])
+        every = np.array([0.0, amounts[0], 0.0, 0.0])
         error = evidence.squares(range(4), every) + evidence.floor
         residual, columns = without_starts(ahead, error, (residual, columns))
     y, x = (rows * residual).ravel(), (rows[..., None] * columns).reshape(-1, 4)
     left = lambda keep: np.sum(
         (y - x[:, keep] @ np.linalg.lstsq(x[:, keep], y, rcond=None)[0]) ** 2
     )
-    for k in (0, 2, 3):
+    for k in (0, 2):
         assert gains[k] == pytest.approx((left([1]) - left([1, k])) / 2, rel=0.05, abs=1e-3)
+    assert abs(gains[3]) < 1e-3
+
+
+def test_a_first_look_leaves_amounts_at_their_bounds_where_they_are():
+    rng, ahead = np.random.default_rng(6), scene()
+    columns = clustered(rng, ahead, (2,))
+    columns[..., 1] += columns[..., 0]
+    evidence = evidence_of(ahead, columns @ [1.0, 1.0] + 0.01 * clustered(rng, ahead), columns)
+    far, low, high, *prior = np.full(2, 9.0), *nothing_bounds(1)
+    look = lambda high: evidence.looks(((0,), low, high, *prior), np.ones(1), -far, far)[1]
+    assert look(high) > 0 and look(np.ones(1)) > 0
+    assert look(np.ones(1)) != pytest.approx(look(high), rel=0.01)
 
 
 def test_a_first_look_promises_no_more_than_amounts_within_their_bounds():
     rng, ahead = np.random.default_rng(6), scene()
     columns = clustered(rng, ahead, (2,))
     evidence = evidence_of(ahead, columns @ [1.0, 0.0] + 0.01 * clustered(rng, ahead), columns)
-    look = lambda low, high: evidence.looks((), [], [], *np.array([[low] * 2, [high] * 2]))[0]
+    bounds = lambda low, high: np.array([[low] * 2, [high] * 2])
+    look = lambda low, high: evidence.looks(((), *nothing_bounds(0)), [], *bounds(low, high))[0]
     most = look(-9.0, 9.0)
     assert look(0.3, 3.0) == most and look(-9.0, 0.5) == pytest.approx(0.75 * most, rel=0.01)
     assert look(-9.0, 0.0) == 0 > look(3.0, 9.0)

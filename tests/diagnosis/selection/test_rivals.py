@@ -29,7 +29,7 @@ class Named:
 DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)
 
 
-def chosen(monkeypatch, fitted, losses, sensors=(), asked=None):
+def chosen(monkeypatch, fitted, losses, asked=None):
     """(setting's names, {name: names of others}) after classes; losses: {name: unpriced loss} of
     sets of one effect."""
     names = {c.name: c for c in (DRY, CURVED)}
@@ -47,9 +47,7 @@ def chosen(monkeypatch, fitted, losses, sensors=(), asked=None):
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
     world = SimpleNamespace(model=None)
-    chain = SimpleNamespace(world=world, apart=lambda c: c.name in sensors)
-    lacks = [Score(size, np.full(4, size), np.full(4, 4 * size), ()) for size in (1.0, 0.0)]
-    silent = SimpleNamespace(scores=lambda *settings: lacks if sensors else None, chain=chain)
+    silent = SimpleNamespace(chain=SimpleNamespace(world=world))
     held = SimpleNamespace(setting=None)
     monkeypatch.setattr(rivals, "_along", lambda *args: held)
     monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
@@ -84,14 +82,6 @@ def test_only_the_classes_that_are_asked_are_told(monkeypatch):
     close = {"stribeck": 0.0, "coulomb": 0.2}
     assert chosen(monkeypatch, "stribeck", close, asked=[]) == (["stribeck"], {})
     assert chosen(monkeypatch, "stribeck", close, asked=[CURVED])[0] == ["coulomb"]
-
-
-def test_forces_speak_against_no_sensor(monkeypatch):
-    """A rival without a force of its own lacks all of it. That says nothing."""
-    close = {"stribeck": 0.0, "coulomb": 0.35}
-    assert chosen(monkeypatch, "coulomb", close, ["none"])[1] == {"coulomb": []}
-    for one in close:
-        assert chosen(monkeypatch, "coulomb", close, [one])[1] == {"coulomb": ["stribeck"]}
 
 
 FEET = """<mujoco><worldbody><geom name="floor" type="plane" size="5 5 .1"/>

@@ -279,6 +279,27 @@ def test_the_floor_knows_no_more_than_a_file_does():
     assert floor == pytest.approx(stock, rel=0.02)
 
 
+@pytest.mark.parametrize("late", ["lag", "delay"])
+def test_a_file_with_the_true_memory_begins_as_the_machine_does(late):
+    """A lag and a delay, as MJCF has them: what they hold at first is no error of the file."""
+    motor = replace(pendulum().actuators[0], kp=20.0, kv=2.0)
+    robot = replace(pendulum(), actuators=(motor,), integrator="implicitfast", step=2e-4)
+    plan = Plan(0.01, "brisk", "closed", 1e-4, "white", "none", "regular", 0.0, 0.3)
+    law = (L.Lag if late == "lag" else L.Delay)(0, actuator=0, seconds=0.1)
+    system = TrueSystem(robot, [law])
+    run, noise = record(system, plan, np.random.default_rng(3)), np.array([1e-4])
+    spec = mujoco.MjSpec.from_string(to_mjcf(robot))
+    (drive,) = spec.actuators
+    if late == "lag":
+        drive.dyntype, drive.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
+        drive.dynprm[0] = 0.1
+    else:
+        drive.delay, drive.nsample = 0.1, 501
+    file = spec.compile()
+    floor, error = system_error(system, [run], noise), model_error(file, file, [run], noise)
+    assert abs(run.ctrl[0]) > 0.1 and error < 1.1 * floor
+
+
 def test_a_joint_begins_within_its_range_also_where_that_holds_no_zero():
     robot = pendulum(range=(-3.6, -1.0))
     plan = Plan(0.01, "brisk", "open", 1e-4, "white", "none", "regular", 0.0, 0.2)
