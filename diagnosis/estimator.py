@@ -296,17 +296,21 @@ def _strain(candidate, values, prior):
 
 def _refitted(search, outcome, decides, log, some, out):
     """The setting of some findings without one that kept-back recordings spoke against: what made
-    up for that one may be another then, which one more round finds. It may only make up for what is
-    gone, by the same recordings."""
+    up for that one may be another then, which one more round finds, and what could stand in its
+    place. Either may only make up for what is gone, by the same recordings."""
     found, judge = outcome.found, outcome.found.judge
     search.candidates = [c for c in search.candidates if c is not out]
     plain = judge.fit(some, steps=3)
+    harms = lambda new, old: (
+        new.setting.keys() != old.setting.keys()
+        and decides.worse(new.setting, old.setting) > decides.scattered()
+    )
     fitted = judge.fit(search.again(plain.setting, outcome.trajectory).setting)
+    fitted = plain if harms(fitted, plain) else fitted
     new = fitted.setting.keys() - some.keys()
-    if new and decides.worse(fitted.setting, plain.setting) > decides.scattered():
-        fitted, new = plain, ()
     near = [c for c in fitted.setting if c in new or rivals.meet(search.world, c, out)]
-    fitted, told = _classes(search, found, fitted, log, search.candidates, near)
+    other, told = _classes(search, found, fitted, log, search.candidates, near)
+    fitted, told = (fitted, {}) if harms(other, fitted) else (other, told)
     told, still = {**outcome.others, **told}, set(search.candidates) - set(fitted.setting)
     outcome.others = {c: [o for o in told[c] if o[0] in still] for c in told}
     return _earned(search, judge, fitted).setting  # what was earned beside it goes, too

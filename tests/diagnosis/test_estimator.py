@@ -294,7 +294,14 @@ def test_an_event_removes_error_where_it_is_and_has_a_value(
         assert event.removed == removed and event.candidate is mass
 
 
-@pytest.mark.parametrize("worse, kept", [(-5.0, {"gain", "friction"}), (2.0, {"gain"})])
+@pytest.mark.parametrize(
+    "worse, kept",
+    [
+        ({"friction": -5.0, "lag": -6.0}, {"gain", "lag"}),
+        ({"friction": -5.0, "lag": 2.0}, {"gain", "friction"}),  # as a class would have it
+        ({"friction": 2.0, "lag": 2.0}, {"gain"}),
+    ],
+)
 def test_what_made_up_for_a_finding_that_goes_may_be_another_by_the_same_recordings(
     monkeypatch, worse, kept
 ):
@@ -305,17 +312,19 @@ def test_what_made_up_for_a_finding_that_goes_may_be_another_by_the_same_recordi
     found = SimpleNamespace(judge=SimpleNamespace(fit=fit))
     others = {"gain": [("delay", 0.02)]}
     outcome = SimpleNamespace(found=found, trajectory=None, others=others)
-    decides = SimpleNamespace(worse=lambda new, plain: worse, scattered=lambda: 1.0)
+    named = lambda setting: next(iter(setting.keys() - {"gain"}))
+    decides = SimpleNamespace(worse=lambda new, old: worse[named(new)], scattered=lambda: 1.0)
 
     def classes(search, found, fitted, log, candidates, near):
         asked.extend(near)
-        return fitted, {c: [] for c in near}
+        setting = {"lag" if c == "friction" else c: v for c, v in fitted.setting.items()}
+        return Set(setting=setting), {c: [] for c in near}
 
     monkeypatch.setattr(estimator, "_classes", classes)
     monkeypatch.setattr(estimator, "_earned", lambda search, judge, fitted: fitted)
     monkeypatch.setattr(estimator.rivals, "meet", lambda world, c, out: False)
     setting = estimator._refitted(search, outcome, decides, None, {"gain": 0.8}, "delay")
-    assert set(setting) == kept and set(asked) == kept - {"gain"}
+    assert set(setting) == kept and asked == (["friction"] if len(kept) > 1 else [])
     assert "delay" not in search.candidates  # no more, nor as what a finding may be
     assert outcome.others["gain"] == []
 
