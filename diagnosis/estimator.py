@@ -317,12 +317,16 @@ def _refitted(search, outcome, decides, log, some, out):
 
 
 def _nearest(judge, outcome, decides):
-    """The setting of a curve that the force at a joint follows, where a Check says that it predicts
-    better than the nominal model by more than noise does; None where there is none."""
+    """The setting of a curve that the force at a joint follows, worth the price of a force without
+    a name, where a Check says that it predicts better than the nominal model by more than noise
+    does, without the window that says so most; None where there is none."""
+    nothing = judge.fit({})
     for rest in missing_force.each_joint(outcome.dependences)[:2]:
-        setting = judge.fit({rest.candidate: rest.values}, steps=2).setting
-        if decides.worse({}, setting) > decides.scattered():
-            return setting
+        curve = judge.fit({rest.candidate: rest.values}, steps=2)
+        step = paired(nothing.score, curve.score)
+        told = step.gain > PRICE * UNNAMED and step.p_value < LEVEL
+        if told and decides.worse({}, curve.setting, uncounted=1) > decides.scattered():
+            return curve.setting
     return None
 
 

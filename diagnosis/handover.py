@@ -125,10 +125,11 @@ class Check:
         turned = {r: undone(model, off, r) for r in recordings}
         return [w._replace(recording=turned[w.recording]) for w in windows]
 
-    def worse(self, setting, other):
-        """By how much a setting's files predict worse than another one's, at least."""
+    def worse(self, setting, other, uncounted=0):
+        """By how much a setting's files predict worse than another one's, at least, but for so many
+        windows in which they are worse by most."""
         mine, others = (self.squares(Files.of(self.world, s), s) for s in (setting, other))
-        return _worse(mine, others)
+        return _worse(mine, others, uncounted)
 
     def _parts(self, files, windows, measured):
         """Parts of the squared error (W,) of windows begun otherwise than they were measured."""

@@ -10,7 +10,7 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 from diagnosis import estimator
 from diagnosis.estimator import identify
 from diagnosis.recordings.recording import RecordingError
-from diagnosis.selection.criterion import PRICE, complexity
+from diagnosis.selection.criterion import PRICE, Score, complexity
 from diagnosis.simulation.simulator import World
 
 
@@ -329,15 +329,25 @@ def test_what_made_up_for_a_finding_that_goes_may_be_another_by_the_same_recordi
     assert outcome.others["gain"] == []
 
 
-@pytest.mark.parametrize("better, chosen", [((2.0, 9.0), "first"), ((0.5, 9.0), "second")])
-def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(better, chosen):
+@pytest.mark.parametrize(
+    "better, gain, chosen",
+    [
+        ((2.0, 9.0), 0.5, "first"),
+        ((0.5, 9.0), 0.5, "second"),
+        ((0.5, 0.5), 0.5, None),  # no more joints are asked
+        ((2.0, 9.0), 0.1, None),  # it is not worth its price to the recordings it was fitted to
+    ],
+)
+def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(better, gain, chosen):
     names = "first", "second", "third"
     left = [SimpleNamespace(joint=n, candidate=n, values=(1.0,)) for n in names]
-    judge = SimpleNamespace(fit=lambda setting, steps: Set(setting=setting))
+    groups = lambda loss: Score(
+        loss, loss + np.linspace(-1e-3, 1e-3, 16), 4 * np.full(16, loss), ()
+    )
+    fit = lambda setting, steps=0: Set(setting=setting, score=groups(-gain if setting else 0.0))
     gains = dict(zip(names, (*better, 99.0)))
-    worse = lambda nominal, setting: gains[min(setting)]
+    worse = lambda nominal, setting, uncounted: gains[min(setting)] if uncounted == 1 else np.nan
     decides = SimpleNamespace(worse=worse, scattered=lambda: 1.0)
     outcome = SimpleNamespace(dependences=left)
-    assert estimator._nearest(judge, outcome, decides) == {chosen: (1.0,)}
-    gains |= dict.fromkeys(names[:2], 0.5)  # the third joint is not asked
-    assert estimator._nearest(judge, outcome, decides) is None
+    nearest = estimator._nearest(SimpleNamespace(fit=fit), outcome, decides)
+    assert nearest == ({chosen: (1.0,)} if chosen else None)
