@@ -14,7 +14,7 @@ from diagnosis.effects.bodies import size_of
 from diagnosis.effects.unmodelled import asked
 from diagnosis.estimation import windowing
 
-WAVE = ("waves", np.inf, 1.0, np.inf), ("plain", np.inf, -10, 10)  # its number, its phase
+WAVE = ("waves", np.inf, 0.5, np.inf), ("plain", np.inf, -10, 10)  # its number, its phase
 TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 
 # of each effect: (unit, scale, low, high), one row for all its parameters, or one for each. Units:
@@ -51,7 +51,7 @@ TABLE = {
     "torque_speed": [("plain", np.inf, 0.0, np.inf), ("used", np.inf, 0.05, np.inf)],
     "delay": [("plain", 0.03, 0.0, 0.15)],
     "lag": [("plain", 0.03, 0.0, 0.3)],
-    "dead_zone": [("used", 0.15, 0.0, 0.5)],
+    "dead_zone": [("used", 0.15, 0.0, 1.0)],
     "gravity": [("plain", 1.0, -12.0, 12.0)],
     "wind": [("plain", 3.0, -30.0, 30.0)],
     "air_drag": [("plain", np.inf, 0.0, 3000.0)],
