@@ -14,7 +14,7 @@ from diagnosis.effects.bodies import size_of
 from diagnosis.effects.unmodelled import asked
 from diagnosis.estimation import windowing
 
-WAVE = ("waves", np.inf, 0.5, np.inf), ("plain", np.inf, -10, 10)  # its number, its phase
+WAVE = ("waves", np.inf, 1.0, np.inf), ("plain", np.inf, -10, 10)  # its number, its phase
 TAIL = 4.0  # degrees of freedom of the priors: Student's, for surprises happen
 
 # of each effect: (unit, scale, low, high), one row for all its parameters, or one for each. Units:

@@ -47,6 +47,13 @@ def test_every_effect_of_the_catalogue_has_a_prior_about_its_nominal_values(mach
             assert own_low >= min(low, n) and own_high <= max(high, n), c
 
 
+def test_a_dead_zone_may_take_all_that_is_asked_for():
+    world, _ = driven_by('<motor name="m" joint="j"/>')
+    usual = Usual(world, [commanded(0.01 * np.arange(400), np.full((400, 1), 2.0))], np.ones(1))
+    prior = plausible(world.candidate("dead_zone", "m"), usual)
+    assert prior.inside([1.98]) and not prior.inside([2.02])
+
+
 @given(st.lists(st.floats(-6, 6), min_size=2, max_size=2))
 @settings(max_examples=50, deadline=None)
 def test_costs_are_students_and_their_precision_leads_to_the_same_place(z):
