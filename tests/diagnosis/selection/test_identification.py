@@ -291,14 +291,17 @@ def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
     monkeypatch.setattr(search, "locate", lambda setting: ("located", "first"))
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
 
-    def round_of(setting, judge):
-        asked.append(setting)
+    def round_of(setting, judge, curves):
+        asked.append((setting, curves))
         return best
 
     monkeypatch.setattr(search, "_round", round_of)
+    monkeypatch.setattr(search, "_curves", lambda setting: "curves")
     found = search.run()
-    assert asked == [{}, best.setting] and found.fitted is best
+    assert asked == [({}, "curves"), (best.setting, "curves")] and found.fitted is best
     assert (found.trajectory, found.first) == ("moved", "first")
+    search.sets = ["of what was refused"]
+    assert search.again({}, "moved") is best and asked[-1] == ({}, []) and not search.sets
 
 
 def test_what_finer_steps_explain_as_well_is_no_physics(search, monkeypatch):
