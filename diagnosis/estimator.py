@@ -316,7 +316,7 @@ def _refitted(search, outcome, decides, log, some, out):
     return _earned(search, judge, fitted).setting  # what was earned beside it goes, too
 
 
-def _nearest(judge, outcome, decides):
+def _best_curve(judge, outcome, decides):
     """The setting of a curve that the force at a joint follows, worth the price of a force without
     a name, where a Check says that it predicts better than the nominal model by more than noise
     does, without the window that says so most; None where there is none."""
@@ -340,7 +340,7 @@ def _hand_over(search, held, kept_back, outcome, log):
         decides = Check(world, kept_back, Smoother(world, kept_back), noise)
     judge, refit = found.judge, partial(_refitted, search, outcome, decides, log)
     outcome.handed = accepted(world, decides, setting, refit, log, told=check)
-    curve = None if physics(outcome.handed.setting) else _nearest(judge, outcome, decides)
+    curve = None if physics(outcome.handed.setting) else _best_curve(judge, outcome, decides)
     if curve:
         handed = accepted(world, decides, curve, log=log, told=check)
         outcome.handed = replace(handed, gone=outcome.handed.gone)

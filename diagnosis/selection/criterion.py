@@ -273,8 +273,9 @@ class Evidence:
         """In-sample gain (K,) in nats of each further column, between bounds (K,) of its amount,
         beside some, given as score() takes them, that move along from amounts (p,): a first
         look."""
-        columns, *bounds, precision, pull = given
-        index, sums = np.concatenate([[0], np.asarray(columns, int) + 1]), self.sums
+        columns, lowest, highest, precision, pull = given
+        columns, sums = np.asarray(columns, int), self.sums
+        index = np.concatenate([[0], columns + 1])
         square = self.squares(columns, np.asarray(amounts, float))
         weight = self.group.T @ self.weighed(square)  # (W, cells)
         moved = sums.moved(sums.crossed, square, self.floor)
@@ -289,10 +290,10 @@ class Evidence:
         own = (own - 2 * np.einsum("wik,wik->k", taken, moved))[1:]
         score, cross = beside[1:, 0] - beside[1:, 1:] @ amounts, beside[1:, 1:]
         # the least squares of these weights are not quite where the amounts are
-        steep = score[index[1:] - 1] + pull - precision * amounts
-        stuck = [(amounts <= bounds[0]) & (steep <= 0), (amounts >= bounds[1]) & (steep >= 0)]
-        goes = np.flatnonzero(~np.logical_or(*stuck))
-        inside = cross[index[1:] - 1] + np.diag(precision)
+        steep = score[columns] + pull - precision * amounts
+        stuck = (amounts <= lowest) & (steep <= 0) | (amounts >= highest) & (steep >= 0)
+        goes = np.flatnonzero(~stuck)
+        inside = cross[columns] + np.diag(precision)
         inside += 1e-9 * np.diag(np.diag(inside))  # of two columns that are the same
         share = np.linalg.solve(inside[np.ix_(goes, goes)], cross[:, goes].T).T
         score = score - share @ steep[goes]

@@ -117,11 +117,10 @@ class Identification:
     def _round(self, setting, judge, curves):
         """The Fitted set that a round ends with; curves: [(candidate, values)] that compete."""
         others = [c for c in self.candidates if c not in setting]
-        every = [*setting, *others]
         known = self.usual, self.seen, self.trajectory, self.screen.touches
         starts = Starts(self.world, setting, *known)
         self.missing = missing = MissingForce(self.screen, setting, self.missing)
-        tried = starts.of(every)
+        tried = starts.of([*setting, *others])
         some = likely(missing, tried)
         some += [starts.curve(*curve) for curve in curves]
         columns = Columns(self.screen, setting, some, seen=self.seen)

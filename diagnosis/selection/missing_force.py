@@ -46,10 +46,11 @@ class MissingForce:
             self.done = {key: done for key, done in known if key[0] not in inside}
         if len(self.rows):
             driven = t.driven[self.rows, chain.model.nv :]
-            size = np.linalg.norm(driven, axis=1)
-            sticks = size < STICKS * rms(size)  # a joint that sticks obeys no force
+            moves = np.linalg.norm(driven, axis=1)
+            sticks = moves < STICKS * rms(moves)  # a joint that sticks obeys no force
             self.obeyed = np.where(sticks[..., None], 0.0, np.linalg.pinv(driven))
             self.whole = self._pushed(self.plain)
+            # it was located under the chain's own setting
             force = t.force[self.rows] + self.whole - self._pushed(chain.base)
             size = 1.4826 * np.median(abs(force), 0) + SMALLEST * rms(force) + 1e-12
             seen = np.isfinite(chain.noise)

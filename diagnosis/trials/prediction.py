@@ -110,11 +110,10 @@ def model_residuals(nominal, model, runs, noise, horizon=HORIZON, step=None, shi
 def _hold(model, data, drives, ctrl):
     """What waits and what filters begins as after the first control (nu,) that was recorded, held
     for long: a recording does not tell what was before."""
-    data.ctrl[drives] = ctrl
-    for drive in drives:
+    for drive, value in zip(drives, ctrl):
         u = model.actuator_ctrladr[drive]
-        limits = model.actuator_ctrlrange[u] if model.actuator_ctrllimited[u] else (-np.inf, np.inf)
-        value = np.clip(data.ctrl[u], *limits)
+        if model.actuator_ctrllimited[u]:
+            value = np.clip(value, *model.actuator_ctrlrange[u])
         if model.actuator_delay[drive] > 0:
             count = model.actuator_history[drive, 0]
             past = -model.opt.timestep * np.arange(count, 0, -1)

@@ -349,5 +349,5 @@ def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(bett
     worse = lambda nominal, setting, uncounted: gains[min(setting)] if uncounted == 1 else np.nan
     decides = SimpleNamespace(worse=worse, scattered=lambda: 1.0)
     outcome = SimpleNamespace(dependences=left)
-    nearest = estimator._nearest(SimpleNamespace(fit=fit), outcome, decides)
-    assert nearest == ({chosen: (1.0,)} if chosen else None)
+    curve = estimator._best_curve(SimpleNamespace(fit=fit), outcome, decides)
+    assert curve == ({chosen: (1.0,)} if chosen else None)
