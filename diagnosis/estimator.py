@@ -8,24 +8,21 @@ held-out ones are only predicted.
 """
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from diagnosis import findings
 from diagnosis.effects.unmodelled import Unknown
-from diagnosis.estimation.intervals import intervals
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
-from diagnosis.selection import missing_force, rivals, transients
-from diagnosis.selection.conditions import concentrated
+from diagnosis.selection import missing_force, moments, rivals, transients
 from diagnosis.selection.criterion import PRICE, complexity, paired
 from diagnosis.selection.identification import LEVEL, Found, Identification, physics, said
 from diagnosis.selection.judge import Fitted, changing, channel, lacking, share_left, without
 from diagnosis.selection.plausibility import plausible
-from diagnosis.selection.transients import Event
 from diagnosis.unnamed import NEAREST, UNNAMED
 
 STRAINS = 4.0  # scales of its prior, beyond which a value is told to strain it
@@ -51,7 +48,8 @@ class Outcome:
     handed: Handed = None
     train_check: Check = None
     held_check: Check = None
-    event: object = None
+    event: object = None  # Event
+    there: dict = field(default_factory=dict)  # {Candidate: share removed while it acts}
     earned: bool = False
 
 
@@ -69,7 +67,8 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         )
     search = Identification(world, train, say, log)
     found = search.run()
-    event = transients.happened(world, train, found)
+    timed = any(c.when for c in found.fitted.setting)
+    event = None if timed else transients.happened(world, train, found)
     if event and not plausible(event.candidate, found.usual).inside(np.array(event.values)):
         event = None
     if event:
@@ -82,7 +81,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     others = rivals.together(others, fitted, found.sets)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
-    outcome.event = event or _sometimes(search, found, outcome.fitted, log)
+    outcome.event = event
     outcome.earned = bool(outcome.fitted.setting or outcome.event)
     say(0.85, "checking what is handed over")
     _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
@@ -190,74 +189,15 @@ def _one_curve(search, found, fitted, log):
     return fitted
 
 
-def _sometimes(search, found, fitted, log):
-    """The Event of what is missing beside a Fitted set under a condition only, or None: the effect
-    that a search finds where it holds, or the curve that the located force follows there."""
-    where = concentrated(fitted)
-    if not where:
-        return None
-    return _named_there(search, found, fitted, where, log) or _curve_there(
-        search, found, fitted, where, log
-    )
-
-
-def _named_there(search, found, fitted, where, log):
-    """The Event of the effect that a search finds beside a Fitted set where a Condition holds."""
-    world, judge = search.world, found.judge
-    parts = where.parts(search.train)
-    if not parts:
-        return None
-    there = Identification(world, parts, log=log)
-    inside = there.run(fitted.setting)
-    best, others = _classes(there, inside, inside.fitted, log, there.candidates)
-    # what has states of its own cannot come and go
-    steady = lambda c: c in fitted.setting or c.effect.numerical or world.adds_states(c)
-    new = [c for c in best.setting if not steady(c)]
-    if not new:
-        return None
-    most = max(new, key=lambda c: without(best, c).loss)
-    placed, values = where.placed(world, most), best.setting[most]
-    beside = judge.fit({**fitted.setting, placed: values}, steps=0)
-    log(f"  {placed} {fitted.loss:.3f} -> {beside.loss:.3f}")
-    removed = where.removed(fitted, beside)
-    if beside.loss >= fitted.loss or removed <= 0:
-        return None
-    bounds = intervals(best)[most]
-    if not findings.certain(most, bounds):
-        return None
-    low, high = zip(*(b or (v, v) for b, v in zip(bounds, values)))
-    told = placed, values, where.recording, where.time, where.p_value
-    also = tuple((where.placed(world, c), v) for c, v in others.get(most, ()))
-    return Event(*told, low=low, high=high, removed=removed, others=also)
-
-
-def _curve_there(search, found, fitted, where, log):
-    """The Event of a force without a name that the located force follows there."""
-    judge, rest = found.judge, where.dependence(search.world, found.trajectory, search.train)
-    if not rest:
-        return None
-    beside = judge.fit({**fitted.setting, rest.candidate: rest.values}, steps=0)
-    step = paired(fitted.score, beside.score)  # of the one curve that is asked
-    if step.gain < PRICE * UNNAMED or step.p_value > LEVEL:
-        return None
-    beside = search.further(judge, beside)
-    losses = f"{fitted.loss:.3f} -> {beside.loss:.3f}"
-    log(f"  {rest.variables} at times: {rest.candidate.when} {losses}")
-    values = beside.setting[rest.candidate]
-    told = rest.candidate, values, where.recording, where.time, where.p_value
-    return Event(*told, low=values, high=values, removed=where.removed(fitted, beside))
-
-
 def _nameless(search, outcome):
     """Fill in what a perfect simulator would remove of what is left, in finer steps, and what the
-    located force follows where most of it is left."""
+    located force follows there."""
     finer = search.finer(outcome.found.judge, outcome.fitted)
-    outcome.lacks, where = lacking(finer), concentrated(outcome.fitted)
-    trajectory, rows = outcome.trajectory, where.rows(search.train) if where else True
+    outcome.lacks = lacking(finer)
     if finer is not outcome.fitted:
-        trajectory = copy(outcome.found.smoother).locate(finer.setting, trajectory, passes=1)
-    if where or finer is not outcome.fitted:
-        outcome.left = missing_force.dependences(search.world, trajectory, search.train, rows=rows)
+        given = finer.setting, outcome.trajectory
+        trajectory = copy(outcome.found.smoother).locate(*given, passes=1)
+        outcome.left = missing_force.dependences(search.world, trajectory, search.train)
 
 
 def _beside(search, judge, fitted, rest, price):
@@ -349,8 +289,11 @@ def _hand_over(search, held, kept_back, outcome, log):
         outcome.fitted = judge.fit(kept, steps=0)
     for c, v in kept.items():
         less = without(outcome.fitted, c)
+        rest = {other: x for other, x in kept.items() if other is not c}
         if np.isinf(less.loss):  # of what small changes tell nothing
-            less = judge.fit({other: x for other, x in kept.items() if other is not c}, steps=2)
+            less = judge.fit(rest, steps=2)
+        if c.when:
+            outcome.there[c] = moments.removed(judge.fit(rest, steps=0), outcome.fitted, c.when)
         outcome.p_values[c] = paired(less.score, outcome.fitted.score).p_value
         outcome.strains[c] = _strain(c, v, plausible(c, found.usual))
     if set(kept) != set(found.fitted.setting):

@@ -130,6 +130,7 @@ def _finding(world, candidate, outcome, bounds, figure):
         "evidence": {
             "held_out_error_removed": removed(handed.without[candidate], after, before),
             "p_value": outcome.p_values[candidate],
+            **({"error_removed_there": outcome.there[candidate]} if candidate.when else {}),
         },
         "adequate": not curve and certain(candidate, bounds[candidate]),
         "strains": outcome.strains.get(candidate),

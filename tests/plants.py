@@ -312,3 +312,23 @@ def recorded(name, seed, damping=0.05, mass=0.5, push=None, seconds=4.0, noise=N
     return Recording(
         name, time, qpos + noise * rng.normal(size=qpos.shape), np.full((rows, 1), np.nan), ctrl, {}
     )
+
+
+def loaded(seed, lasting, carried, between, rows=400):
+    """A run of a pendulum, `lasting` times as heavy as nominal, for a while `carried` times: with a
+    small load at its centre of mass."""
+    rng, time = np.random.default_rng(seed), 0.01 * np.arange(rows)
+    models = [
+        mujoco.MjModel.from_xml_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5 * ratio))
+        for ratio in (lasting, carried)
+    ]
+    models[1].body_inertia[1] = models[0].body_inertia[1]
+    mujoco.mj_setConst(models[1], mujoco.MjData(models[1]))
+    data, period = mujoco.MjData(models[0]), rng.uniform(0.6, 1.2, 3)
+    ctrl = (0.4 * np.sin(2 * np.pi * time[:, None] / period)).sum(1, keepdims=True)
+    qpos = np.empty((rows, 1))
+    for t in range(rows):
+        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
+        mujoco.mj_step(models[int(between[0] <= time[t] < between[1])], data, 2)
+    noisy = qpos + NOISE * rng.normal(size=qpos.shape)
+    return Recording("run.csv", time, noisy, np.full((rows, 1), np.nan), ctrl, {})

@@ -13,7 +13,7 @@ Values are absolute, in SI units, with the sign of the MJCF field. A new effect 
 the decorator @catalogue, and no other line.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import mujoco
@@ -87,6 +87,11 @@ class Candidate:
     @property
     def nominal(self):
         return tuple(p.nominal for p in self.parameters)
+
+    @property
+    def lasting(self):
+        """The same candidate without a condition."""
+        return replace(self, when=None) if self.when else self
 
 
 class Part(NamedTuple):

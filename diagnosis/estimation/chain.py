@@ -14,7 +14,7 @@ import numpy as np
 
 from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import Ahead, with_own_step
-from diagnosis.simulation.rows import RowMap, coarse
+from diagnosis.simulation.rows import RowMap, coarse, holds
 from diagnosis.simulation.simulator import Case
 
 # fields of a model that its inertia hangs by
@@ -182,7 +182,7 @@ class Chain(Ahead):
     def apart(self, candidate):
         """Whether an effect is more than what happens within a row."""
         effect = candidate.effect
-        wide = candidate.when or effect.overrides("measure") or effect.numerical
+        wide = effect.overrides("measure") or effect.numerical
         return bool(wide) or self.world.adds_states(candidate)
 
     def plain(self, setting):
@@ -192,6 +192,16 @@ class Chain(Ahead):
     def missing(self, setting, rows):
         """(rows, 2 nv): the smoothed motion less the predicted one, a row on, of rows (n,), under
         a plain setting, as forces change it in the model of the chain: these superpose."""
+        found = self._missing({c: v for c, v in setting.items() if not c.when}, rows)
+        condition = next((c.when for c in setting if c.when), None)
+        if condition:
+            there = self._missing({c.lasting: v for c, v in setting.items()}, rows)
+            share = holds(condition, list(self.trajectory.first))
+            found += share[np.searchsorted(self.map.begin, rows), None] * (there - found)
+        return found
+
+    def _missing(self, setting, rows):
+        """As of missing(), of a setting without conditions."""
         found = self._rows({**self.coarse, **setting}, rows)
         found += self.finer[np.searchsorted(self.begin, rows)]
         model = self.map.model

@@ -136,14 +136,15 @@ class Beam:
 
     def others(self, node):
         """Indices of the options of effects that a node does not hold."""
-        options, held = self.columns.options, self._candidates(node)
-        return [k for k in self.free if options[k].candidate not in held]
+        options = self.columns.options
+        held = {c.lasting for c in self._candidates(node)}
+        return [k for k in self.free if options[k].candidate.lasting not in held]
 
     def gains(self, node):
         """{k: nats} that options of effects which a node does not hold promise, in a first look."""
         low, high = map(np.concatenate, zip(*((o.low, o.high) for o in self.columns.options)))
         given = self._problem(node.options)
-        gain = self.evidence.looks(given, node.score.amounts, low, high)
+        [gain] = self.evidence.looks(given, node.score.amounts, low, high)
         return {k: gain[list(self.columns.options[k].columns)].sum() for k in self.others(node)}
 
     def _looks(self, node):
@@ -180,7 +181,8 @@ def likely(missing, starts):
     if in_rows:
         bases = {start: missing.basis(start) for start in in_rows}
         in_windows += [start for start in in_rows if bases[start] is None]
-        some = _by_rows(missing.force, {s: b for s, b in bases.items() if b is not None}, rounds)
+        bases = {start: basis for start, basis in bases.items() if basis is not None}
+        some = _by_rows(missing.force, bases, rounds)
     if in_windows:
         some += _by_windows(chain.beginnings(*GLANCES), setting, kept, in_windows, rounds)
     return [*dict.fromkeys([*kept, *some])]  # a wave may be among the best in windows as well

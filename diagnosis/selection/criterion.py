@@ -28,6 +28,7 @@ LIGHTEST = 0.01  # share of its inertia that a joint is taken to have at least
 ITERATIONS = 4  # of reweighted least squares
 TOGETHER = 16  # hypotheses that are worked out at once
 PRICE = 0.1  # nats of log RMS error, summed over channels, that a unit of complexity has to remove
+MOMENT = 1  # units of complexity of acting for a while only
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,9 @@ class Comparison:
 
 def complexity(candidates):
     """Of a set of effects: how far each is from the first things to think of, and its freedom."""
-    return sum(c.effect.simplicity + (1 + len(c.parameters)) / 2 for c in candidates)
+    at_times = lambda c: MOMENT if c.when and not c.effect.timed else 0.0
+    each = lambda c: c.effect.simplicity + at_times(c) + (1 + len(c.parameters)) / 2
+    return sum(map(each, candidates))
 
 
 def paired(before, after):
@@ -269,35 +272,46 @@ class Evidence:
         each = 1 / (np.maximum(self.count, 1) * (square + self.floor))
         return np.where(self.count > 0, each, 0.0)
 
-    def looks(self, given, amounts, low, high):
-        """In-sample gain (K,) in nats of each further column, between bounds (K,) of its amount,
-        beside some, given as score() takes them, that move along from amounts (p,): a first
-        look."""
+    def looks(self, given, amounts, low, high, inside=None):
+        """In-sample gain (C, K) in nats of each further column, between bounds (K,) of its amount,
+        beside some, given as score() takes them, that move along from amounts (p,): a first look.
+        inside (C, W): in which windows further columns act; by default, once, in all."""
         columns, lowest, highest, precision, pull = given
-        columns, sums = np.asarray(columns, int), self.sums
-        index = np.concatenate([[0], columns + 1])
-        square = self.squares(columns, np.asarray(amounts, float))
+        columns, amounts = np.asarray(columns, int), np.asarray(amounts, float)
+        beside, own = self._by_window(columns, amounts)
+        within = beside[:, columns, 1:].sum(0) + np.diag(precision)
+        within += 1e-9 * np.diag(np.diag(within))  # of two columns that are the same
+        # the least squares of these weights are not quite where the amounts are
+        steep = beside[:, columns, 0].sum(0) + pull - within @ amounts
+        stuck = (amounts <= lowest) & (steep <= 0) | (amounts >= highest) & (steep >= 0)
+        goes = np.flatnonzero(~stuck)
+        inside = np.ones((1, len(own))) if inside is None else inside
+        beside, own = np.einsum("cw,wkp->ckp", inside, beside), inside @ own
+        cross = beside[..., 1 + goes]
+        share = np.linalg.solve(within[np.ix_(goes, goes)], np.swapaxes(cross, 1, 2))
+        score = beside[..., 0] - beside[..., 1:] @ amounts - np.swapaxes(share, 1, 2) @ steep[goes]
+        curve = own - (np.swapaxes(share, 1, 2) * cross).sum(-1)
+        seen = curve > 1e-9 * np.maximum(own, 1e-300)
+        amount = np.clip(score / np.where(seen, curve, np.inf), low, high)
+        return np.where(seen, amount * (score - amount * curve / 2), 0.0)
+
+    def _by_window(self, columns, amounts):
+        """Products of every column with the residual and some columns (W, K, 1 + p), and with
+        itself (W, K), start states free, weighed where the errors are those of amounts (p,)."""
+        sums, index = self.sums, np.concatenate([[0], columns + 1])
+        square = self.squares(columns, amounts)
         weight = self.group.T @ self.weighed(square)  # (W, cells)
         moved = sums.moved(sums.crossed, square, self.floor)
         crossed = np.einsum("wc,wcik->wik", weight, sums.crossed)
         # of each column what start states leave of it: x - S moved
         taken = crossed - np.einsum("wc,wcij->wij", weight, sums.starts) @ moved / 2
-        row = weight.ravel()[sums.cell]
-        beside = sums.columns @ (sums.columns[index] * row).T
-        beside -= np.einsum("wik,wip->kp", taken, moved[..., index])
-        beside -= np.einsum("wik,wip->kp", moved, taken[..., index])
-        own = np.einsum("kn,n,kn->k", sums.columns, row, sums.columns)
-        own = (own - 2 * np.einsum("wik,wik->k", taken, moved))[1:]
-        score, cross = beside[1:, 0] - beside[1:, 1:] @ amounts, beside[1:, 1:]
-        # the least squares of these weights are not quite where the amounts are
-        steep = score[columns] + pull - precision * amounts
-        stuck = (amounts <= lowest) & (steep <= 0) | (amounts >= highest) & (steep >= 0)
-        goes = np.flatnonzero(~stuck)
-        inside = cross[columns] + np.diag(precision)
-        inside += 1e-9 * np.diag(np.diag(inside))  # of two columns that are the same
-        share = np.linalg.solve(inside[np.ix_(goes, goes)], cross[:, goes].T).T
-        score = score - share @ steep[goes]
-        curve = own - (share * cross[:, goes]).sum(1)
-        seen = curve > 1e-9 * np.maximum(own, 1e-300)
-        amount = np.clip(score / np.where(seen, curve, np.inf), low, high)
-        return np.where(seen, amount * (score - amount * curve / 2), 0.0)
+        beside = -np.einsum("wik,wip->wkp", taken, moved[..., index])
+        beside -= np.einsum("wik,wip->wkp", moved, taken[..., index])
+        own = -2 * np.einsum("wik,wik->wk", taken, moved)
+        row, windows = weight.ravel()[sums.cell], sums.cell // sums.shape[1]
+        ends = np.searchsorted(windows, np.arange(len(weight) + 1))
+        for w, (a, b) in enumerate(zip(ends[:-1], ends[1:])):
+            some = sums.columns[:, a:b]
+            beside[w] += some @ (some[index] * row[a:b]).T
+            own[w] += np.einsum("kn,n,kn->k", some, row[a:b], some)
+        return beside[:, 1:], own[:, 1:]

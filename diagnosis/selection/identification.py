@@ -14,13 +14,15 @@ from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
+from diagnosis.selection import moments
 from diagnosis.selection.beam import LEAST, Beam, likely
-from diagnosis.selection.columns import Columns, Starts
+from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.judge import Fitted, Judge, without
 from diagnosis.selection.missing_force import MissingForce, dependences
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.rivals import TIED, as_good, carried
+from diagnosis.selection.starts import Starts
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
@@ -116,7 +118,8 @@ class Identification:
 
     def _round(self, setting, judge, curves):
         """The Fitted set that a round ends with; curves: [(candidate, values)] that compete."""
-        others = [c for c in self.candidates if c not in setting]
+        inside = {c.lasting for c in setting}
+        others = [c for c in self.candidates if c not in inside]
         known = self.usual, self.seen, self.trajectory, self.screen.touches
         starts = Starts(self.world, setting, *known)
         self.missing = missing = MissingForce(self.screen, setting, self.missing)
@@ -128,6 +131,13 @@ class Identification:
         columns.secants(columns.evidence(nominal))
         columns.nearer(nominal, tried)
         evidence = columns.evidence(nominal)
+        timed = starts.of([c for c in self.world.candidates if c.effect.timed])
+        when, timed = moments.proposed(columns, evidence, timed)
+        if timed:
+            self.log(f"  at times: {timed[0].candidate}")
+            some = [starts.curve(*curve) for curve in self._curves(setting, when)]
+            columns = columns.more(timed + some)
+            evidence = columns.evidence(nominal)
         self.looked = max(evidence.different(), 1.0)
         beam, now = Beam(columns, evidence), judge.fit(setting)
         self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; {now.loss:.3f}")
@@ -171,15 +181,19 @@ class Identification:
         self.sets = as_good(judged + earlier, best)
         return best
 
-    def _curves(self, setting):
+    def _curves(self, setting, when=None):
         """[(candidate, values)] of forces without a name, in joints that no effect of a setting has
         for its place: beside one, every curve is significant, and its size decides in the end. What
-        depends on the joint's own speed alone is friction of some kind: names are tried first."""
-        found = dependences(self.world, self.trajectory, self.train)
+        depends on the joint's own speed alone is friction of some kind: names are tried first.
+        when: the condition under which they act."""
+        rows = moments.rows_of(when, self.train) if when else True
+        found = dependences(self.world, self.trajectory, self.train, rows)
         joints = [self.world.joints(c.place) or () for c in setting]
         taken = {self.world.model.joint(j).name for some in joints for j in some}
-        found = [d for d in found if d.variables != (f"velocity:{d.joint}",)]
-        return [(d.candidate, d.values) for d in found if d.joint not in taken][:CURVES]
+        lasts = lambda d: not when and d.variables == (f"velocity:{d.joint}",)
+        found = [d for d in found if d.joint not in taken and not lasts(d)][:CURVES]
+        there = lambda c: self.world.localised(c, when) if when else c
+        return [(there(d.candidate), d.values) for d in found]
 
     def _finalists(self, beam, start, nodes):
         """Two lists of Nodes for the simulator, best first. Sets of other effects, not a better one
@@ -240,7 +254,8 @@ class Identification:
         fine = self.finer(judge, now)
         fine = fine if self.earned(now, fine) else now
         if best is not now:
-            best = self.pruned(judge, self.finer(judge, self.further(judge, best)), now)
+            best = moments.sharpened(judge, self.finer(judge, self.further(judge, best)))
+            best = self.pruned(judge, best, now)
         if best is now or not self.earned(fine, best):
             best = fine
         self.log(f" chosen {best.loss:.3f} {said(best.setting)}")
@@ -251,12 +266,14 @@ class Identification:
         effect of it is one of many too."""
         step = paired(before.score, after.score)
         added = physics(after.setting.keys() - before.setting.keys())
-        return after.loss < before.loss and self.no_chance(step, len(added))
+        timed = any(c.when for c in added)
+        at_times = len(moments.conditions(self.screen.windows)) if timed else 1
+        return after.loss < before.loss and self.no_chance(step, len(added), at_times)
 
-    def no_chance(self, step, added=1):
-        """Whether a Comparison is significant among all sets of so many different columns, with two
-        tests each."""
-        sets = self.looked**added / factorial(added)
+    def no_chance(self, step, added=1, at_times=1):
+        """Whether a Comparison is significant among all sets of so many different columns, under so
+        many conditions, with two tests each."""
+        sets = self.looked**added / factorial(added) * at_times
         return step.p_value < LEVEL / max(sets, self.looked) / 2
 
     def pruned(self, judge, fitted, now):

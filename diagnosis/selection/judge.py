@@ -10,9 +10,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from diagnosis.selection.columns import Columns, Starts
+from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import BEYOND, PRICE, Evidence, Score, complexity, paired
 from diagnosis.selection.plausibility import at_limit, cost, plausible
+from diagnosis.selection.starts import Starts
 
 STEPS = 6  # Gauss-Newton steps of a refit, at most
 DONE = 2e-3  # loss that another step would still remove, from which on a refit is done
@@ -85,7 +86,9 @@ class Judge:
         """Those of a setting's effects, about it; near: a Fitted set that has some of them."""
         known = near.columns if near else None
         starts = Starts(self.ahead.world, setting, self.usual, self.seen).of(setting)
-        return Columns(self.ahead, setting, starts, residual, self.seen, known)
+        columns = Columns(self.ahead, setting, starts, residual, self.seen, known)
+        columns.straighten()
+        return columns
 
     def _better(self, columns, evidence, index, amounts):
         """((setting, residual) after a step that lowers the loss by more than DONE, or None;

@@ -12,11 +12,13 @@ others = together(others, fitted, sets)
 import numpy as np
 
 from diagnosis.effects.unmodelled import Unknown
+from diagnosis.selection import moments
 from diagnosis.selection.beam import likely
-from diagnosis.selection.columns import Columns, Starts
+from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.judge import problem
 from diagnosis.selection.missing_force import MissingForce
+from diagnosis.selection.starts import Starts
 
 APART = 0.3  # share of an effect that another may leave in its place, as far as columns tell
 TIED = 0.1  # nats of log RMS error by which another member of a class may be worse
@@ -111,8 +113,11 @@ def _members(candidates, judge, before, fitted, candidate, held):
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting]
     missing, out = MissingForce(before.chain, rest, before), []
+    world, model = before.chain.world, before.chain.world.model
+    if candidate.when:
+        some = [c for c in world.candidates if not before.chain.apart(c) and c != candidate.lasting]
+        pool += filter(None, (moments.placed(world, c, candidate.when) for c in some))
     # two geoms of one contact share its numbers, and columns tell little of them
-    model = before.chain.world.model
     twin = candidate.effect.twin(model, candidate.effect.id(model, candidate.place.name))
     twins = [c for c in pool if (c.effect, c.place.name) == (candidate.effect, twin)]
     near = [(c, fitted.setting[candidate]) for c in twins]

@@ -1,4 +1,4 @@
-"""Effects that act only for a while, a load picked up, a push: where in time is the error?
+"""Effects that act for a while in one recording, a load picked up, a push: where is the error?
 
 event = find(world, recordings, setting, trajectory, noise)   # None, or an Event
 event.candidate, event.values                                 # a localised Candidate
@@ -129,12 +129,11 @@ def _interval(look, spans, usual):
     k, found = len(look.which), []
     alone = (solved(look.gram, look.score) * look.score).sum(-1)
     spread = max(usual, np.quantile(alone, 0.3) / chi2_ppf(0.3, k))
-    for order, first in spans:
-        score, gram = look.score[order].cumsum(0), look.gram[order].cumsum(0)
+    for span in spans:
+        score, gram = look.score[span].cumsum(0), look.gram[span].cumsum(0)
         gain = (solved(gram, score) * score).sum(-1)
-        found += [(float(g), order, n) for n, g in enumerate(gain, 1) if n > first]
-    for gain, order, n in sorted(found, key=lambda f: -f[0])[:TRIES]:
-        inside = np.sort(order[:n])
+        found += [(float(g), span[:n]) for n, g in enumerate(gain, 1)]
+    for gain, inside in sorted(found, key=lambda f: -f[0])[:TRIES]:
         score, gram = look.score[inside], look.gram[inside]
         value = solved(gram.sum(0), score.sum(0))
         share = 2 * score @ value - np.einsum("i,wij,j->w", value, gram, value)
@@ -145,24 +144,19 @@ def _interval(look, spans, usual):
 
 
 def _spans(windows):
-    """[(indices of windows in an order, first)]: an event may be the first n of them, n > first, of
-    stretches of one recording, and of what begins in all at the same time and goes on."""
+    """[indices of windows]: an event may be the first so many of them, in one recording."""
     owner = [w.recording for w in windows]
     most, out = max(1, int(LONGEST * len(windows))), []
-    recordings = windowing.recordings_of(windows)
-    for r in recordings:
+    for r in windowing.recordings_of(windows):
         mine = np.array([i for i, o in enumerate(owner) if o is r])
-        out += [(mine[a : a + most], 0) for a in range(len(mine))]
-    if len(recordings) > 1:
-        begin = np.array([w.recording.time[w.first] for w in windows])
-        out.append((np.argsort(-begin, kind="stable")[:most], len(recordings) - 1))
+        out += [mine[a : a + most] for a in range(len(mine))]
     return out
 
 
 def quiet(recording, event):
     """[(first row, end row)] of the stretches of a recording that an event does not touch."""
     rows = len(recording.time)
-    if event is None or event.recording not in (None, recording):
+    if event is None or event.recording is not recording:
         return [(recording.start, rows)]
     start, stop = np.searchsorted(recording.time, event.time)
     stretches = (recording.start, int(start)), (int(stop) + 1, rows)
@@ -180,7 +174,7 @@ def calm(recordings, event):
 
 @dataclass(frozen=True)
 class Event:
-    """candidate: localised; values; recording, None for every one; time (from, to), s; low, high:
+    """candidate: localised; values; recording; time (from, to), s; low, high:
     95 % bounds of the values; p_value: corrected for all that was looked at; removed: share of the
     error around it; left: squared residual of all windows with it; others: ((candidate, values),
     ...), what explains it as well."""
@@ -272,26 +266,21 @@ class Local:
 
     def __init__(self, scene, trajectory, chi2, inside):
         """chi2 (W,): squared residuals of the scene's windows without an event; inside: indices in
-        ascending order, of one recording, or to the end of several."""
-        windows, longer = dict(enumerate(scene.windows)), []
+        ascending order, of one recording."""
+        windows = dict(enumerate(scene.windows))
         within = [windows[i] for i in inside]
-        recordings = windowing.recordings_of(within)
-        for r in recordings:
-            mine = [i for i in inside if windows[i].recording is r]
-            near = [windows.get(i) for i in range(mine[0] - 2, mine[-1] + 3)]
-            near = [w for w in near if w and w.recording is r]
-            longer += windowing.consecutive(r, LONGER * SPAN, near[0].first, near[-1].last + 1)
+        self.recording = r = within[0].recording
+        near = [windows.get(i) for i in range(inside[0] - 2, inside[-1] + 3)]
+        near = [w for w in near if w and w.recording is r]
+        longer = windowing.consecutive(r, LONGER * SPAN, near[0].first, near[-1].last + 1)
         self.scene, self.chi2, self.inside = scene, chi2, inside
         self.local = Windows(scene.world, scene.setting, longer, trajectory, scene.noise)
         self.around = float((self.local.plain**2).sum())
-        self.recording = recordings[0] if len(recordings) == 1 else None
-        begin = min(w.recording.time[w.first] for w in within)
-        end = max(w.recording.time[w.last if self.recording else -1] for w in within)
-        self.time, self.sample = [begin, end], float(windowing.sampling(recordings))
+        self.time = [r.time[within[0].first], r.time[within[-1].last]]
+        self.sample = float(windowing.sampling([r]))
 
     def _placed(self, look, time):
-        name = self.recording and self.recording.name
-        when = {"recording": name, "time": [float(t) for t in time]}
+        when = {"recording": self.recording.name, "time": [float(t) for t in time]}
         return self.scene.world.localised(look.timed, when)
 
     def _settings(self, look, time, values):
@@ -319,7 +308,7 @@ class Local:
         ends = list(self.time)
         now = lambda: (np.array(values)[which] - look.base[which]) / look.steps
         for reach in SPAN / 3.0 ** np.arange(4):
-            for end in (0, 1) if self.recording else (0,):  # what is the same in all goes on
+            for end in (0, 1):
                 shifts = np.outer([0.0, *np.linspace(-reach, reach, 6)], np.eye(2)[end])
                 trials = [t for t in (shifts + ends).tolist() if t[1] - t[0] > self.sample]
                 fits = self._fits(look, trials, values)

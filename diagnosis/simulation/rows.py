@@ -60,11 +60,23 @@ def _contact_rates(solref):
     return np.where(first < 0, direct, 1 / np.maximum(first * np.maximum(second, 1), 1e-9))
 
 
+def holds(condition, recordings):
+    """Share (n,) of every row that has a next one for which a condition holds (see
+    Candidate.when)."""
+    (low, high), name = condition["time"], condition["recording"]
+    each = []
+    for r in recordings:
+        time = np.minimum(r.time[1:], high) - np.maximum(r.time[:-1], low)
+        each.append(np.clip(time / np.diff(r.time), 0.0, 1.0) * (name in (None, r.name)))
+    return np.concatenate(each)
+
+
 class RowMap:
     """Simulates every row of some recordings under a setting, with a constant extra force in each.
 
-    Effects that add coordinates (backlash) or states (bristles) of their own or act under a
-    condition are left out: a row knows the nominal model's coordinates alone.
+    Effects that add coordinates (backlash) or states (bristles) of their own are left out: a row
+    knows the nominal model's coordinates alone. Where a condition holds for a part of a row, so
+    much of what acts under it counts.
 
     begin: the rows (n,) that have a next one, counted through all recordings; seconds (n,).
     """
@@ -73,7 +85,12 @@ class RowMap:
         """like: another RowMap of the recordings, whose controls are taken over where they are
         the same."""
         self.world, self.recordings, self.nominal = world, recordings, world.model
-        setting = {c: v for c, v in setting.items() if not c.when and not world.adds_states(c)}
+        setting = {c: v for c, v in setting.items() if not world.adds_states(c)}
+        condition, self.there = next((c.when for c in setting if c.when), None), None
+        if condition:
+            self.there = RowMap(world, recordings, {c.lasting: v for c, v in setting.items()})
+            self.share = holds(condition, recordings)
+        setting = {c: v for c, v in setting.items() if not c.when}
         self.case = case = Case(world.model, setting, 1)
         self.working = world.engine(case.structure).working
         model = self.working.edited(case.on, case.step)
@@ -137,6 +154,18 @@ class RowMap:
 
         Returns qpos (n, nq), qvel (n, nv).
         """
+        out = self._ahead(index, qpos, qvel, force)
+        some = np.flatnonzero(self.share[index]) if self.there else ()
+        if len(some):
+            more = self.there.ahead(index[some], qpos[some], qvel[some], force[some])
+            share = self.share[index[some], None]
+            moved = share * difference(self.nominal, out[0][some], more[0])
+            out[0][some] = integrate(self.nominal, out[0][some], moved)
+            out[1][some] += share * (more[1] - out[1][some])
+        return out
+
+    def _ahead(self, index, qpos, qvel, force):
+        """As of ahead(), without what acts under a condition."""
         held, limit = force + self.forces(index, qpos, qvel), self.limits(index, qpos, qvel)
         if limit is not None:  # of friction, which at most stops the joint by the end of the row
             _, free = self._rolled(index, qpos, qvel, held)

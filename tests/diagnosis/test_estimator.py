@@ -142,7 +142,8 @@ class Search:
 
 
 class Push:
-    effect = SimpleNamespace(simplicity=1)
+    effect = SimpleNamespace(simplicity=1, timed=True)
+    when = {"recording": "run.csv", "time": [1.0, 2.0]}
     parameters = range(3)
 
 
@@ -193,13 +194,9 @@ def test_recordings_without_positions_are_refused():
 
 
 @pytest.mark.parametrize("better", [False, True])
-@pytest.mark.parametrize("where", [False, True])
-def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, better, where):
-    rows = np.array([True, False])
-    condition = SimpleNamespace(rows=lambda train: rows) if where else None
+def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, better):
     monkeypatch.setattr(estimator, "lacking", lambda fitted: fitted.setting)
-    monkeypatch.setattr(estimator, "concentrated", lambda fitted: condition)
-    told = lambda world, trajectory, train, rows: (trajectory, rows)
+    told = lambda world, trajectory, train: trajectory
     monkeypatch.setattr(estimator.missing_force, "dependences", told)
     locate = lambda setting, near, passes: f"{near} in {setting}"
     found = SimpleNamespace(judge=None, smoother=SimpleNamespace(locate=locate))
@@ -209,11 +206,7 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
     outcome = SimpleNamespace(found=found, fitted=fitted, trajectory="motion", left="as it was")
     estimator._nameless(search, outcome)
     assert outcome.lacks == finer.setting
-    if better or where:
-        motion = "motion in finer steps" if better else "motion"
-        assert outcome.left == (motion, rows if where else True)
-    else:
-        assert outcome.left == "as it was"
+    assert outcome.left == ("motion in finer steps" if better else "as it was")
 
 
 @pytest.mark.parametrize(
@@ -248,50 +241,6 @@ def test_a_name_beside_a_curve_of_its_joint_has_to_be_earned_over_the_better_cur
     )
     told = estimator._one_curve(search, SimpleNamespace(judge=judge), both, lambda what: None)
     assert told is sets[chosen]
-
-
-@pytest.mark.parametrize(
-    "loss, removed, bounds, told",
-    [
-        (-1.0, 0.3, (1.0, 3.0), True),
-        (-1.0, -0.05, (1.0, 3.0), False),
-        (0.5, 0.3, (1.0, 3.0), False),
-        (-1.0, 0.3, (0.2, 3.8), False),  # the nominal value is among those that it may have
-    ],
-)
-def test_an_event_removes_error_where_it_is_and_has_a_value(
-    monkeypatch, loss, removed, bounds, told
-):
-    kind = {
-        "effect": SimpleNamespace(numerical=False, amplitudes=0),
-        "parameters": [SimpleNamespace(nominal=0.5)],
-    }
-    mass = type("Mass", (), kind)()
-    search = lambda setting, loss: SimpleNamespace(
-        fitted=SimpleNamespace(setting=setting, loss=loss),
-        candidates=[],
-    )
-    there = SimpleNamespace(run=lambda setting: search({mass: (2.0,)}, 0.0), candidates=[])
-    monkeypatch.setattr(estimator, "Identification", lambda *given, log: there)
-    monkeypatch.setattr(estimator, "_classes", lambda s, found, fitted, log, all: (fitted, {}))
-    monkeypatch.setattr(estimator, "without", lambda fitted, c: fitted)
-    monkeypatch.setattr(estimator, "intervals", lambda fitted: {mass: [bounds]})
-    judge = SimpleNamespace(fit=lambda setting, steps: SimpleNamespace(setting=setting, loss=loss))
-    world = SimpleNamespace(adds_states=lambda c: False)
-    where = SimpleNamespace(
-        parts=lambda train: ["part"],
-        placed=lambda world, c: c,
-        removed=lambda before, after: removed,
-        recording="run",
-        time=(1.0, 2.0),
-        p_value=0.01,
-    )
-    given = SimpleNamespace(world=world, train=[]), SimpleNamespace(judge=judge)
-    fitted = SimpleNamespace(setting={}, loss=0.0)
-    event = estimator._named_there(*given, fitted, where, lambda message: None)
-    assert (event is not None) == told
-    if told:
-        assert event.removed == removed and event.candidate is mass
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,10 @@ from plants import DRIVEN_PENDULUM, NOISE, SIZES, arm, record, recorded
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain, _as_heavy
 from diagnosis.estimation.smoother import Smoother
-from diagnosis.selection.columns import Columns, Starts
+from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.plausibility import Usual
+from diagnosis.selection.starts import Starts
 from diagnosis.simulation import rows
 from diagnosis.simulation.simulator import World
 

@@ -19,6 +19,7 @@ class Named:
     def __init__(self, name):
         self.name, self.parameters, self.nominal = name, (None,), (0.0,)
         possible = lambda values, nominal: True
+        self.when, self.lasting = None, self
         self.effect = SimpleNamespace(name=name, simplicity=0, possible=possible)
 
 

@@ -7,9 +7,10 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.smoother import Smoother
-from diagnosis.selection.columns import Columns, Starts
+from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.selection.starts import Starts
 from diagnosis.simulation.simulator import World
 
 

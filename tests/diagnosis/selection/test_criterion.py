@@ -240,7 +240,7 @@ def test_a_first_look_is_the_gain_of_least_squares(moves, share):
     columns[..., 3] = 2 * columns[..., 1] + 1e-7 * columns[..., 0]  # tells nothing more
     evidence = evidence_of(ahead, residual, columns)
     amounts, far = share * free(evidence, (1,)).amounts, np.full(4, 99.0)
-    gains = evidence.looks(((1,), *nothing_bounds(1)), amounts, -far, far)
+    [gains] = evidence.looks(((1,), *nothing_bounds(1)), amounts, -far, far)
     weight = evidence.weighed(evidence.squares((1,), amounts))
     rows = np.sqrt(weight[ahead.group])[:, None, :] * np.ones(ahead.known.shape)
     if moves:
@@ -262,7 +262,7 @@ def test_a_first_look_leaves_amounts_at_their_bounds_where_they_are():
     columns[..., 1] += columns[..., 0]
     evidence = evidence_of(ahead, columns @ [1.0, 1.0] + 0.01 * clustered(rng, ahead), columns)
     far, low, high, *prior = np.full(2, 9.0), *nothing_bounds(1)
-    look = lambda high: evidence.looks(((0,), low, high, *prior), np.ones(1), -far, far)[1]
+    look = lambda high: evidence.looks(((0,), low, high, *prior), np.ones(1), -far, far)[0, 1]
     assert look(high) > 0 and look(np.ones(1)) > 0
     assert look(np.ones(1)) != pytest.approx(look(high), rel=0.01)
 
@@ -272,7 +272,7 @@ def test_a_first_look_promises_no_more_than_amounts_within_their_bounds():
     columns = clustered(rng, ahead, (2,))
     evidence = evidence_of(ahead, columns @ [1.0, 0.0] + 0.01 * clustered(rng, ahead), columns)
     bounds = lambda low, high: np.array([[low] * 2, [high] * 2])
-    look = lambda low, high: evidence.looks(((), *nothing_bounds(0)), [], *bounds(low, high))[0]
+    look = lambda low, high: evidence.looks(((), *nothing_bounds(0)), [], *bounds(low, high))[0, 0]
     most = look(-9.0, 9.0)
     assert look(0.3, 3.0) == most and look(-9.0, 0.5) == pytest.approx(0.75 * most, rel=0.01)
     assert look(-9.0, 0.0) == 0 > look(3.0, 9.0)

@@ -13,9 +13,10 @@ from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.selection import beam
 from diagnosis.selection.beam import likely
-from diagnosis.selection.columns import Columns, Start, Starts
+from diagnosis.selection.columns import Columns
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.selection.starts import Start, Starts
 from diagnosis.simulation.simulator import World
 
 

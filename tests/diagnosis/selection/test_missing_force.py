@@ -10,10 +10,10 @@ from scipy.ndimage import gaussian_filter1d
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
 from diagnosis.estimation.smoother import Smoother
-from diagnosis.selection.columns import Starts
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
+from diagnosis.selection.starts import Starts
 from diagnosis.simulation.simulator import World
 
 FRICTION = 0.1

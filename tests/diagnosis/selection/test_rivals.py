@@ -24,6 +24,7 @@ class Named:
         known["twin"] = lambda model, i: None
         self.effect = SimpleNamespace(simplicity=units - 1, name=name, numerical=False, **known)
         self.parameters, self.place = (None,), SimpleNamespace(name="elbow")
+        self.when, self.lasting = None, self
 
 
 DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)

@@ -11,8 +11,8 @@ from plants import DRIVEN_PENDULUM, DROP, commanded, driven_by, dropped, recorde
 from diagnosis.effects.friction import TURNS
 from diagnosis.effects.joints import JointStop
 from diagnosis.estimation.smoother import Trajectory
-from diagnosis.selection.columns import STEP, Starts
 from diagnosis.selection.plausibility import Usual, plausible
+from diagnosis.selection.starts import STEP, Starts
 from diagnosis.simulation.simulator import World
 
 

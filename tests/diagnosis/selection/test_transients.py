@@ -5,34 +5,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from plants import DRIVEN_PENDULUM, NOISE, recorded
+from plants import DRIVEN_PENDULUM, loaded, recorded
 
 from diagnosis import findings
 from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
-from diagnosis.report import text
 from diagnosis.selection import transients
 from diagnosis.simulation.simulator import World
-
-
-def loaded(seed, lasting, carried, between, rows=400):
-    """A run of a pendulum, `lasting` times as heavy as nominal, for a while `carried` times: with a
-    small load at its centre of mass."""
-    rng, time = np.random.default_rng(seed), 0.01 * np.arange(rows)
-    models = [
-        mujoco.MjModel.from_xml_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5 * ratio))
-        for ratio in (lasting, carried)
-    ]
-    models[1].body_inertia[1] = models[0].body_inertia[1]
-    mujoco.mj_setConst(models[1], mujoco.MjData(models[1]))
-    data, period = mujoco.MjData(models[0]), rng.uniform(0.6, 1.2, 3)
-    ctrl = (0.4 * np.sin(2 * np.pi * time[:, None] / period)).sum(1, keepdims=True)
-    qpos = np.empty((rows, 1))
-    for t in range(rows):
-        qpos[t], data.ctrl[:] = data.qpos, ctrl[t]
-        mujoco.mj_step(models[int(between[0] <= time[t] < between[1])], data, 2)
-    noisy = qpos + NOISE * rng.normal(size=qpos.shape)
-    return Recording("run.csv", time, noisy, np.full((rows, 1), np.nan), ctrl, {})
 
 
 def found(runs, setting=None):
@@ -129,17 +108,6 @@ def test_a_load_may_be_carried_through_one_recording_of_three():
     assert event.candidate.effect.name == "payload_change" and event.recording is runs[1]
     assert event.values[0] == pytest.approx(1.0, rel=0.03)
     assert event.time == pytest.approx((0.0, 3.99), abs=0.2)  # what is left of whole windows
-
-
-def test_a_load_that_every_recording_picks_up_at_the_same_time_stays():
-    runs = [replace(loaded(k, 1.0, 2.0, (2.2, 9.0)), name=f"run{k}.csv") for k in range(3)]
-    event = found(runs)
-    told = findings.of_event(event)
-    assert told["effect"] == "payload_change" and event.values[0] == pytest.approx(1.0, rel=0.02)
-    assert told["when"]["recording"] is None
-    assert told["when"]["time"] == pytest.approx([2.2, 3.99], abs=0.03)
-    assert "in every recording from 2.2" in text.finding_words(told)
-    assert [r.time[-1] < 2.25 for r in transients.calm(runs, event)] == [True] * 3
 
 
 def test_what_explains_as_much_and_lasts_speaks_against_an_event():
