@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation import windowing
 from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import PRICE, Evidence, complexity
 from diagnosis.selection.judge import problem
 
+CLEARLY = 2.0  # times what any name that lasts promises, that one at times must promise
 TOLD = 6  # effects that are tried under the condition
 STARTS = 2  # of each of them
 CLOSER = 0.25, 0.05  # of a window, by which a moment is moved
@@ -66,34 +68,55 @@ def placed(world, candidate, when):
     return world.localised(candidate, when)
 
 
+def unnamed(option):
+    """Whether an option is a curve, which follows anything."""
+    return isinstance(option.candidate.effect, Unknown)
+
+
 def proposed(columns, evidence, timed):
     """(condition, [Start]) of the effects that promise most under the condition under which one
-    promises most, beside the setting of some Columns; (None, []) of nothing to ask. timed: Starts
-    of effects that never last."""
+    promises most, beside the setting of some Columns; (None, []) where no one promises
+    clearly more than any name that lasts. timed: Starts of effects that never last."""
     if any(c.when for c in columns.setting):  # no two conditions at once
         return None, []
     columns, reference = columns.more(timed), evidence.reference
-    chain, options, evidence = columns.ahead, columns.options, columns.evidence(reference)
-    kept = [k for k, o in enumerate(options) if o.candidate in columns.setting]
-    each = conditions(chain.windows)
-    at = lambda o: each and placed(chain.world, o.candidate, each[0].when)
-    new = lambda o: o.candidate not in columns.setting and not chain.apart(o.candidate)
-    free = [o for o in options if new(o) and at(o)]
-    if not free:
+    chain, evidence = columns.ahead, columns.evidence(reference)
+    each, free = conditions(chain.windows), _free(columns)
+    if not each or not free:
         return None, []
-    given = problem(columns, kept)
-    low, high = (np.concatenate([getattr(o, end) for o in options]) for end in ("low", "high"))
-    inside = np.array([c.inside for c in each], float)
-    gains = evidence.looks(given, evidence.score(*given).amounts, low, high, inside)
-    gain = lambda o: gains[:, list(o.columns)].sum(1) / evidence.number
-    worth = np.array([gain(o) - PRICE * complexity([at(o)]) for o in free]).T
-    best, first = np.unravel_index(np.argmax(worth), worth.shape)
+    inside = np.array([np.ones(len(chain.windows)), *(c.inside for c in each)])
+    promise = _promise(columns, evidence, inside)
+    at = lambda o: placed(chain.world, o.candidate, each[0].when)
+    lasts = [promise(o)[0] for o in free if not (o.candidate.effect.timed or unnamed(o))]
+    some = [o for o in free if at(o)]
+    gains = np.array([promise(o)[1:] for o in some]).T
+    comes = gains - PRICE * np.array([complexity([at(o)]) for o in some])
+    best, first = np.unravel_index(np.argmax(comes), comes.shape)
+    if gains[best, first] < CLEARLY * max(lasts, default=0.0):
+        return None, []
     when, told = each[best].when, {}
     if each[best].recording is None:
-        when = _closer(columns, reference, free[first], when)
-    for k in np.argsort(-worth[best]):
-        told.setdefault(free[k].candidate, []).append(_under(chain.world, free[k].start, when))
-    return when, [start for some in list(told.values())[:TOLD] for start in some[:STARTS]]
+        when = _closer(columns, reference, some[first], when)
+    for k in np.argsort(-comes[best]):
+        told.setdefault(some[k].candidate, []).append(_under(chain.world, some[k].start, when))
+    return when, [start for starts in list(told.values())[:TOLD] for start in starts[:STARTS]]
+
+
+def _free(columns):
+    """The options of Columns that a row or a few tell all of, but for those of the setting."""
+    new = lambda c: c not in columns.setting and not columns.ahead.apart(c)
+    return [o for o in columns.options if new(o.candidate)]
+
+
+def _promise(columns, evidence, inside):
+    """What an option promises, nats (C,) of a look, beside the setting, where it acts in windows
+    inside (C, W)."""
+    options = columns.options
+    kept = [k for k, o in enumerate(options) if o.candidate in columns.setting]
+    given = problem(columns, kept)
+    low, high = (np.concatenate([getattr(o, end) for o in options]) for end in ("low", "high"))
+    gains = evidence.looks(given, evidence.score(*given).amounts, low, high, inside)
+    return lambda option: gains[:, list(option.columns)].sum(1) / evidence.number
 
 
 def _under(world, start, when):
