@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from diagnosis import findings
+from diagnosis.effects.base import condition_of
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
@@ -67,8 +68,8 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
         )
     search = Identification(world, train, say, log)
     found = search.run()
-    timed = any(c.when for c in found.fitted.setting)
-    event = None if timed else transients.happened(world, train, found)
+    at_times = condition_of(found.fitted.setting)
+    event = None if at_times else transients.happened(world, train, found)
     if event and not plausible(event.candidate, found.usual).inside(np.array(event.values)):
         event = None
     if event:

@@ -166,8 +166,8 @@ def led(world, outcome, findings, something, channels):
         joint = finding["place"]["name"] if finding["effect"] == "unknown" else None
         if candidate and joint is None:
             at, share = main_joint(world, outcome, candidate, shares)
-            told = at not in off and not candidate.when  # no file holds what comes and goes
-            errors = channels.get(f"qpos:{at}") if told else None
+            held = at not in off and not candidate.when  # no file holds what comes and goes
+            errors = channels.get(f"qpos:{at}") if held else None
             shown, clearly = held_out_share(errors) if errors else (np.inf, False)
             least = min(share, shown)
             told = least if np.isfinite(least) else None

@@ -94,6 +94,12 @@ class Candidate:
         return replace(self, when=None) if self.when else self
 
 
+def condition_of(candidates):
+    """The condition under which some of a set act (see Candidate.when), None without: a set has
+    one at most."""
+    return next((c.when for c in candidates if c.when), None)
+
+
 class Part(NamedTuple):
     """What corrected.py adds: a law of diagnosis/simulation/corrected_template.py, where, its
     numbers."""

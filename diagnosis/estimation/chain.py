@@ -12,6 +12,7 @@ size: both run on through the same linear transitions.
 import mujoco
 import numpy as np
 
+from diagnosis.effects.base import condition_of
 from diagnosis.estimation import windowing
 from diagnosis.estimation.ahead import Ahead, with_own_step
 from diagnosis.simulation.rows import RowMap, coarse, holds
@@ -193,7 +194,7 @@ class Chain(Ahead):
         """(rows, 2 nv): the smoothed motion less the predicted one, a row on, of rows (n,), under
         a plain setting, as forces change it in the model of the chain: these superpose."""
         found = self._missing({c: v for c, v in setting.items() if not c.when}, rows)
-        condition = next((c.when for c in setting if c.when), None)
+        condition = condition_of(setting)
         if condition:
             there = self._missing({c.lasting: v for c, v in setting.items()}, rows)
             share = holds(condition, list(self.trajectory.first))

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import PRICE, Score, complexity, paired
 from diagnosis.selection.judge import moved_setting, nominal, problem
@@ -117,7 +116,7 @@ class Beam:
     def _unnamed(self, k):
         """Whether an option is a curve: it leaves so little that what stands beside it would fill
         the beam. The next round looks for that."""
-        return isinstance(self.columns.options[k].candidate.effect, Unknown)
+        return self.columns.options[k].unnamed
 
     def _candidates(self, node):
         return frozenset(self.columns.options[k].candidate for k in node.options)

@@ -17,10 +17,10 @@ from diagnosis.selection.starts import NEARER, Start
 
 TOGETHER = 40  # settings that are simulated in one call
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
-# of what columns of one effect tell best, what they tell of something at least; of a step's size,
-# that one along the former has at least
+# share of what the best told direction of an effect changes, below which another one is hardly
+# told; a step along the best one is shortened to that at most
 SLIGHT = 0.1
-PASSES = 3  # of such
+PASSES = 3  # simulations of such columns that follow the first, at most
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -10,6 +10,7 @@ from math import factorial
 
 import numpy as np
 
+from diagnosis.effects.base import condition_of
 from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.chain import Chain
@@ -266,8 +267,7 @@ class Identification:
         effect of it is one of many too."""
         step = paired(before.score, after.score)
         added = physics(after.setting.keys() - before.setting.keys())
-        timed = any(c.when for c in added)
-        at_times = len(moments.conditions(self.screen.windows)) if timed else 1
+        at_times = len(moments.conditions(self.screen.windows)) if condition_of(added) else 1
         return after.loss < before.loss and self.no_chance(step, len(added), at_times)
 
     def no_chance(self, step, added=1, at_times=1):

@@ -10,19 +10,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.effects.unmodelled import Unknown
+from diagnosis.effects.base import condition_of
 from diagnosis.estimation import windowing
 from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import PRICE, Evidence, complexity
 from diagnosis.selection.judge import problem
+from diagnosis.selection.transients import STEADY
 
 CLEARLY = 2.0  # times what any name that lasts promises, that one at times must promise
 TOLD = 6  # effects that are tried under the condition
 STARTS = 2  # of each of them
 CLOSER = 0.25, 0.05  # of a window, by which a moment is moved
 REACH = 4  # such moves, either way
-STEADY = {"mass": "payload_change"}  # what lasts, and what comes and goes in its place
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ def conditions(windows):
     begin = np.array([w.recording.time[w.first] for w in windows])
     some = recordings if len(recordings) > 1 else []
     each = [Condition(r, (r.time[0], r.time[-1]), np.array([o is r for o in owner])) for r in some]
-    moments = np.unique(begin)[1:] if len(some) or len(windows) > 1 else []
-    return each + [Condition(None, (t, end), begin >= t) for t in moments]
+    return each + [Condition(None, (t, end), begin >= t) for t in np.unique(begin)[1:]]
 
 
 def rows_of(when, recordings):
@@ -62,22 +61,17 @@ def rows_of(when, recordings):
 def placed(world, candidate, when):
     """A candidate that acts under a condition; None of what another effect is then, as a mass that
     comes is a load."""
-    name, place = STEADY.get(candidate.effect.name), candidate.place
-    if any((c.effect.name, c.place) == (name, place) for c in world.candidates):
+    loads = [c for c in world.candidates if c.effect.timed and c.place == candidate.place]
+    if any(STEADY[load.effect.name] == candidate.effect.name for load in loads):
         return None
     return world.localised(candidate, when)
-
-
-def unnamed(option):
-    """Whether an option is a curve, which follows anything."""
-    return isinstance(option.candidate.effect, Unknown)
 
 
 def proposed(columns, evidence, timed):
     """(condition, [Start]) of the effects that promise most under the condition under which one
     promises most, beside the setting of some Columns; (None, []) where no one promises
     clearly more than any name that lasts. timed: Starts of effects that never last."""
-    if any(c.when for c in columns.setting):  # no two conditions at once
+    if condition_of(columns.setting):  # no two at once
         return None, []
     columns, reference = columns.more(timed), evidence.reference
     chain, evidence = columns.ahead, columns.evidence(reference)
@@ -87,7 +81,7 @@ def proposed(columns, evidence, timed):
     inside = np.array([np.ones(len(chain.windows)), *(c.inside for c in each)])
     promise = _promise(columns, evidence, inside)
     at = lambda o: placed(chain.world, o.candidate, each[0].when)
-    lasts = [promise(o)[0] for o in free if not (o.candidate.effect.timed or unnamed(o))]
+    lasts = [promise(o)[0] for o in free if not (o.candidate.effect.timed or o.unnamed)]
     some = [o for o in free if at(o)]
     gains = np.array([promise(o)[1:] for o in some]).T
     comes = gains - PRICE * np.array([complexity([at(o)]) for o in some])
@@ -144,7 +138,7 @@ def _closer(columns, reference, option, when):
 def sharpened(judge, fitted):
     """A Fitted set with the moment of what acts from one on moved to where the simulator leaves
     least."""
-    when = next((c.when for c in fitted.setting if c.when), None)
+    when = condition_of(fitted.setting)
     if not when or when["recording"]:
         return fitted
     world, ahead = judge.ahead.world, judge.ahead

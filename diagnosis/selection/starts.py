@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from diagnosis.effects.unmodelled import Unknown
 from diagnosis.estimation import windowing
 from diagnosis.selection.plausibility import plausible
 
@@ -45,6 +46,11 @@ class Start:
     def whole(self):
         """Whether these are whole values, of which no small share says anything."""
         return bool((self.low > 0).any())
+
+    @property
+    def unnamed(self):
+        """Whether it is a curve, which follows anything."""
+        return isinstance(self.candidate.effect, Unknown)
 
     def reach(self):
         """Bounds (low, high) (p,) of the amounts within which the values are plausible; its own

@@ -9,7 +9,7 @@ import numpy as np
 from mujoco import rollout
 
 from diagnosis.common.coordinates import difference, integrate
-from diagnosis.effects.base import JOINT_TRANSMISSIONS, runge_kutta
+from diagnosis.effects.base import JOINT_TRANSMISSIONS, condition_of, runge_kutta
 from diagnosis.simulation.batch import threads
 from diagnosis.simulation.control_signal import SLACK
 from diagnosis.simulation.simulator import Case
@@ -86,7 +86,7 @@ class RowMap:
         the same."""
         self.world, self.recordings, self.nominal = world, recordings, world.model
         setting = {c: v for c, v in setting.items() if not world.adds_states(c)}
-        condition, self.there = next((c.when for c in setting if c.when), None), None
+        condition, self.there = condition_of(setting), None
         if condition:
             self.there = RowMap(world, recordings, {c.lasting: v for c, v in setting.items()})
             self.share = holds(condition, recordings)
