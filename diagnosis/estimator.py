@@ -138,7 +138,8 @@ def _checked(search, found, fitted, others, log):
     left = missing_force.dependences(world, trajectory, train)
     shares = share_left(fitted) if fitted.setting else None
     finer = None  # what finer steps explain as well is no force
-    for rest in missing_force.each_joint(left)[:2]:
+    done = fitted.setting and not search.something(fitted)
+    for rest in [] if done else missing_force.each_joint(left)[:2]:
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
         dof = world.model.joint(rest.joint).dofadr[0]
         if mine and not shares[channel(fitted, dof)] > NEAREST:

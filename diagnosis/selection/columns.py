@@ -16,6 +16,7 @@ from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.starts import NEARER, Start
 
 TOGETHER = 40  # settings that are simulated in one call
+MOVED = 4  # candidates of which whole values are moved
 SECANTS = 24  # candidates that are simulated once more at the values that suit them best
 # share of what the best told direction of an effect changes, below which another one is hardly
 # told; a step along the best one is shortened to that at most
@@ -217,26 +218,30 @@ class Columns:
     def nearer(self, reference, starts):
         """Whole values of which no share means anything again, between the best of those tried and
         its neighbours among starts, as waves are moved: the criterion cannot move these, and a tone
-        between two that are tried is out of step within a second."""
+        between two that are tried is out of step within a second. Of the MOVED candidates that leave
+        least."""
         of = lambda start: start.base + start.directions[0]
         fixed = lambda s: (s.low >= s.high).all() and (of(s) > 0).all() and np.isfinite(of(s)).all()
-        some = [o.candidate for o in self.options if fixed(o) and o.candidate not in self.setting]
-        for candidate in dict.fromkeys(some):
+        some = [o for o in self.options if fixed(o) and o.candidate not in self.setting]
+        order = sorted(some, key=dict(zip(some, self._alone(some, reference))).get)
+        for candidate in [*dict.fromkeys(o.candidate for o in order)][:MOVED]:
             line, ways = [s for s in starts if s.candidate is candidate and fixed(s)], []
             for share in NEARER:
                 mine = [o for o in self.options if o.candidate is candidate and fixed(o)]
-                best = self._best_of(mine, reference)
+                best = mine[int(np.argmin(self._alone(mine, reference)))]
                 ways = ways or _ways(of(best), [of(start) for start in line])
                 rows = [of(best) * np.exp(share * way) for way in ways]
                 rows = [row - best.base for row in rows if best.prior.inside(row)]
                 self._simulate([replace(line[0], directions=row[None]) for row in rows])
 
-    def _best_of(self, options, reference):
-        """The one of options with one column that leaves least."""
+    def _alone(self, options, reference):
+        """The loss (n,) that each of some options with one column leaves alone."""
+        if not options:
+            return []
         columns = np.stack([self.parts[o.columns[0]] for o in options], -1)
         given = [((k,), o.low, o.high, *o.quadratic()) for k, o in enumerate(options)]
         scores = Evidence(self.ahead, self.residual, columns, reference).scores(given)
-        return options[int(np.argmin([score.loss for score in scores]))]
+        return [score.loss for score in scores]
 
 
 def _ways(values, line):

@@ -19,7 +19,7 @@ from diagnosis.selection import moments
 from diagnosis.selection.beam import LEAST, Beam, likely
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
-from diagnosis.selection.judge import Fitted, Judge, without
+from diagnosis.selection.judge import Fitted, Judge, perfect, without
 from diagnosis.selection.missing_force import MissingForce, dependences
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.rivals import TIED, as_good, carried
@@ -27,6 +27,7 @@ from diagnosis.selection.starts import Starts
 
 ROUNDS = 4
 LEVEL = 0.05  # of false additions in all that is looked at
+LEFT = 0.05  # p-value of what a perfect simulator is better by, from which on nothing is left
 CURVES = 4  # that compete in a round, of those that a located force follows best
 FINALISTS = 4  # sets that the simulator judges in a round
 ALONE = 4  # single effects that it judges beside them
@@ -66,19 +67,19 @@ class Identification:
         """The Found of all rounds, begun with the nominal model, or with a setting."""
         setting = setting or {}
         trajectory, first = self.locate(setting)
-        for i in range(ROUNDS):
+        for i in range(ROUNDS + 1):
             judge = self.begin(setting, trajectory)
+            now = judge.fit(setting)
+            if i == ROUNDS or (i and not self.something(now)):
+                self.missing = MissingForce(self.screen, setting, self.missing)
+                fitted, self.sets = now, carried(judge, self.sets, now, now)
+                break
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
-            fitted = self._round(setting, judge, self._curves(setting))
+            fitted = self._round(judge, now, self._curves(setting))
             if fitted.setting.keys() == setting.keys():
                 break
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory, passes=1)
-        else:  # rounds ended with a set from which nothing has begun
-            judge = self.begin(setting, trajectory)
-            self.missing = MissingForce(self.screen, setting, self.missing)
-            fitted = judge.fit(setting)
-            self.sets = carried(judge, self.sets, fitted, fitted)
         known = trajectory, first, self.smoother, self.usual, judge
         return Found(fitted, *known, self.missing, self.ranking, self.sets)
 
@@ -86,7 +87,16 @@ class Identification:
         """The Fitted set of one more round, without curves, from a setting and a trajectory of one
         like it."""
         trajectory, self.sets = self.smoother.locate(setting, trajectory, passes=1), []
-        return self._round(setting, self.begin(setting, trajectory), [])
+        judge = self.begin(setting, trajectory)
+        return self._round(judge, judge.fit(setting), [])
+
+    @staticmethod
+    def something(fitted):
+        """Whether a perfect simulator would still be better than a Fitted set by no chance: if not,
+        nothing that is looked for can be."""
+        each = fitted.evidence, perfect(fitted, quiet=True)
+        left, drawn = (evidence.at((), np.zeros(0)) for evidence in each)
+        return paired(left, drawn).p_value < LEFT
 
     def locate(self, setting):
         """(trajectory under a setting, trajectory under the nominal model), by which the windows
@@ -117,8 +127,10 @@ class Identification:
         ahead.start(copy(self.smoother).locate(setting, self.trajectory, passes=2), setting)
         return Judge(ahead, self.usual, judge.reference, self.seen)
 
-    def _round(self, setting, judge, curves):
-        """The Fitted set that a round ends with; curves: [(candidate, values)] that compete."""
+    def _round(self, judge, now, curves):
+        """The Fitted set that a round ends with, begun with the Fitted one that there is; curves:
+        [(candidate, values)] that compete."""
+        setting = now.setting
         inside = {c.lasting for c in setting}
         others = [c for c in self.candidates if c not in inside]
         known = self.usual, self.seen, self.trajectory, self.screen.touches
@@ -140,7 +152,7 @@ class Identification:
             columns = columns.more(timed + some)
             evidence = columns.evidence(nominal)
         self.looked = max(evidence.different(), 1.0)
-        beam, now = Beam(columns, evidence), judge.fit(setting)
+        beam = Beam(columns, evidence)
         self.log(f"{len(columns.parts)} columns, {columns.simulated} simulated; {now.loss:.3f}")
         self.ranking = self.ranking or beam.ranking()  # of the first look of all
         judged = self._judged(judge, beam, now)

@@ -183,7 +183,7 @@ def share_left(fitted):
     """Share (channels,) of the nominal model's error that a Fitted set leaves, both beyond what a
     perfect simulator errs; NaN where the nominal model hardly errs by more than that."""
     evidence, seen = fitted.evidence, fitted.evidence.count > 0
-    floor = np.maximum(_perfect(fitted).square, evidence.noise**2)
+    floor = np.maximum(perfect(fitted).square, evidence.noise**2)
     each = lambda x: np.where(seen, x, 0.0).reshape(len(x), evidence.channels, -1).sum((0, 2))
     excess = lambda x: each(np.maximum(x - floor, 0.0))
     before, after = excess(evidence.reference), excess(evidence.square)
@@ -200,20 +200,27 @@ def lacking(fitted):
     """[Comparison] of each channel: what a perfect simulator would remove of the error of a Fitted
     set, start states free."""
     evidence = fitted.evidence
-    scores = map(evidence.each_channel, (evidence.square, _perfect(fitted).square))
+    scores = map(evidence.each_channel, (evidence.square, perfect(fitted).square))
     return [paired(before, after) for before, after in zip(*scores)]
 
 
-def _perfect(fitted):
+def perfect(fitted, quiet=False):
     """The Evidence of windows drawn as if a set were true: begun at states as far off as the
     smoother leaves them, and read with noise, as much louder, if at all, as the shortest
-    predictions err: a force that is missing hardly shows in them, noise that is not white does."""
+    predictions err: a force that is missing hardly shows in them, noise that is not white does.
+    quiet: no louder than the noise is known to be."""
     ahead, evidence = fitted.columns.ahead, fitted.evidence
-    shortest = lambda x: x.reshape(len(x), evidence.channels, -1)[:, :, 0]
-    count, square, [noise] = map(shortest, (evidence.count, evidence.square, evidence.noise[None]))
-    mean = (count * square).sum(0) / np.maximum(count.sum(0), 1)
     louder, rng = np.ones(ahead.model.nv), np.random.default_rng(0)
-    for dofs, times in zip(ahead.channels, mean / np.maximum(noise**2, 1e-300)):
-        louder[dofs] = np.sqrt(max(times, 1.0))
+    if not quiet:
+        for dofs, times in zip(ahead.channels, _shortest(evidence)):
+            louder[dofs] = max(times, 1.0)
     drawn = ahead.drawn(fitted.setting, fitted.columns.residual, louder, rng)
     return Evidence(ahead, drawn, reference=evidence.reference)
+
+
+def _shortest(evidence):
+    """RMS errors (channels,) of the shortest predictions, in units of the noise."""
+    first = lambda x: x.reshape(len(x), evidence.channels, -1)[:, :, 0]
+    count, square, [noise] = map(first, (evidence.count, evidence.square, evidence.noise[None]))
+    mean = (count * square).sum(0) / np.maximum(count.sum(0), 1)
+    return np.sqrt(mean / np.maximum(noise**2, 1e-300))

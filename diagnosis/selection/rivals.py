@@ -124,10 +124,9 @@ def _members(candidates, judge, before, fitted, candidate, held):
     alike = _alike(judge, missing, candidate, pool, held)
     near += [(other, values) for other, values in alike if other not in twins]
     for other, values in near[:REFITS]:
-        tried = judge.fit({**rest, other: values}, steps=2, near=fitted)
-        if not tried.settled or not (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
-            continue
-        out.append((judge.fit(tried.setting, near=tried), other))
+        tried = judge.fit({**rest, other: values}, near=fitted)
+        if tried.settled and (_tied(tried.score, fitted.score) or tried.loss < fitted.loss):
+            out.append((tried, other))
     return sorted(out, key=lambda pair: pair[0].loss)
 
 

@@ -7,6 +7,7 @@ from plants import DRIVEN_PENDULUM, NOISE, recorded
 
 from diagnosis.estimation.ahead import Ahead, cut_ahead
 from diagnosis.estimation.smoother import Smoother
+from diagnosis.selection.identification import Identification
 from diagnosis.selection.judge import Judge, lacking, share_left
 from diagnosis.selection.plausibility import Usual
 from diagnosis.simulation.simulator import World
@@ -35,6 +36,14 @@ def test_a_true_model_lacks_nothing():
 def test_a_missing_force_is_lacking():
     [lack] = lacking(judged(0, damping=0.1))
     assert lack.gain > 0.2 and lack.p_value < 1e-3
+
+
+def test_a_search_goes_on_while_something_is_left():
+    """A damping that is twice its model's, then told, then told by a spring."""
+    something = lambda told: Identification.something(judged(0, told, damping=0.1))
+    assert something(None) and not something({("viscous_damping", "pivot"): (0.1,)})
+    assert something({("stiffness", "pivot"): (0.01,)})
+    assert sum(Identification.something(judged(seed)) for seed in range(6)) <= 2
 
 
 def test_a_name_leaves_what_it_does_not_explain():

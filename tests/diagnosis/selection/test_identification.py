@@ -286,22 +286,41 @@ def test_a_stop_on_a_side_where_none_is_met_is_no_finding(search, shown, left):
 
 
 def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
-    best, asked = fitted(search, ["armature"], -1.0), []
-    monkeypatch.setattr(search, "begin", lambda *given: None)
+    nothing, best, asked = fitted(search, [], 0.0), fitted(search, ["armature"], -1.0), []
+    judge = SimpleNamespace(fit=lambda setting, **how: best if setting else nothing)
+    monkeypatch.setattr(search, "begin", lambda *given: judge)
     monkeypatch.setattr(search, "locate", lambda setting: ("located", "first"))
+    monkeypatch.setattr(search, "something", lambda now: True)
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
 
-    def round_of(setting, judge, curves):
-        asked.append((setting, curves))
+    def round_of(judge, now, curves):
+        asked.append((now, curves))
         return best
 
     monkeypatch.setattr(search, "_round", round_of)
     monkeypatch.setattr(search, "_curves", lambda setting: "curves")
     found = search.run()
-    assert asked == [({}, "curves"), (best.setting, "curves")] and found.fitted is best
+    assert asked == [(nothing, "curves"), (best, "curves")] and found.fitted is best
     assert (found.trajectory, found.first) == ("moved", "first")
     search.sets = ["of what was refused"]
-    assert search.again({}, "moved") is best and asked[-1] == ({}, []) and not search.sets
+    assert search.again({}, "moved") is best and asked[-1] == (nothing, []) and not search.sets
+
+
+def test_no_round_follows_a_set_beside_which_a_perfect_simulator_is_no_better(search, monkeypatch):
+    nothing, best, asked = fitted(search, [], 0.0), fitted(search, ["armature"], -1.0), []
+    judge = SimpleNamespace(fit=lambda setting, **how: best if setting else nothing)
+    monkeypatch.setattr(search, "begin", lambda *given: judge)
+    monkeypatch.setattr(search, "locate", lambda setting: ("located", "first"))
+    monkeypatch.setattr(search, "something", lambda now: now is not best)
+    monkeypatch.setattr(search, "_round", lambda judge, now, curves: asked.append(now) or best)
+    monkeypatch.setattr(search, "_curves", lambda setting: "curves")
+    monkeypatch.setattr(identification, "MissingForce", lambda *given: "missing")
+    monkeypatch.setattr(identification, "carried", lambda judge, sets, now, best: ["sets"])
+    search.smoother = SimpleNamespace(locate=lambda *given, **how: "moved")
+    search.usual = search.screen = None
+    found = search.run()
+    assert asked == [nothing] and found.fitted is best
+    assert (found.missing, found.sets) == ("missing", ["sets"])
 
 
 def test_what_finer_steps_explain_as_well_is_no_physics(search, monkeypatch):
