@@ -218,8 +218,8 @@ class Columns:
     def nearer(self, reference, starts):
         """Whole values of which no share means anything again, between the best of those tried and
         its neighbours among starts, as waves are moved: the criterion cannot move these, and a tone
-        between two that are tried is out of step within a second. Of the MOVED candidates that leave
-        least."""
+        between two that are tried is out of step within a second. Only of the MOVED candidates
+        that leave least."""
         of = lambda start: start.base + start.directions[0]
         fixed = lambda s: (s.low >= s.high).all() and (of(s) > 0).all() and np.isfinite(of(s)).all()
         some = [o for o in self.options if fixed(o) and o.candidate not in self.setting]
