@@ -260,16 +260,33 @@ def _refitted(search, outcome, decides, log, some, out):
 
 def _best_curve(judge, outcome, decides):
     """The setting of a curve that the force at a joint follows, worth the price of a force without
-    a name, where a Check says that it predicts better than the nominal model by more than noise
+    a name, where a Check says that it predicts better than what is handed over by more than noise
     does, without the window that says so most; None where there is none."""
-    nothing = judge.fit({})
+    nothing, handed = judge.fit({}), outcome.handed.setting
     for rest in missing_force.each_joint(outcome.dependences)[:2]:
         curve = judge.fit({rest.candidate: rest.values}, steps=2)
         step = paired(nothing.score, curve.score)
         told = step.gain > PRICE * UNNAMED and step.p_value < LEVEL
-        if told and decides.worse({}, curve.setting, uncounted=1) > decides.scattered():
+        if told and decides.worse(handed, curve.setting, uncounted=1) > decides.scattered():
             return curve.setting
     return None
+
+
+def _keep(judge, outcome):
+    """Fit what is handed over, if that is not what was fitted."""
+    if outcome.handed.setting != outcome.fitted.setting:
+        outcome.fitted = judge.fit(outcome.handed.setting, steps=0)
+
+
+def _curve_instead(judge, outcome, decides, accepted):
+    """Hand over a curve where nothing has a name or names leave much, and it predicts better."""
+    if physics(outcome.fitted.setting) and not (share_left(outcome.fitted) > NEAREST).any():
+        return
+    curve = _best_curve(judge, outcome, decides)
+    handed = accepted(curve) if curve else None
+    if handed and handed.setting:
+        outcome.handed = replace(handed, gone=outcome.handed.gone)
+        _keep(judge, outcome)
 
 
 def _hand_over(search, held, kept_back, outcome, log):
@@ -282,13 +299,9 @@ def _hand_over(search, held, kept_back, outcome, log):
         decides = Check(world, kept_back, Smoother(world, kept_back), noise)
     judge, refit = found.judge, partial(_refitted, search, outcome, decides, log)
     outcome.handed = accepted(world, decides, setting, refit, log, told=check)
-    curve = None if physics(outcome.handed.setting) else _best_curve(judge, outcome, decides)
-    if curve:
-        handed = accepted(world, decides, curve, log=log, told=check)
-        outcome.handed = replace(handed, gone=outcome.handed.gone)
-    kept = outcome.handed.setting
-    if kept != setting:
-        outcome.fitted = judge.fit(kept, steps=0)
+    _keep(judge, outcome)
+    _curve_instead(judge, outcome, decides, partial(accepted, world, decides, log=log, told=check))
+    kept = outcome.fitted.setting
     for c, v in kept.items():
         less = without(outcome.fitted, c)
         rest = {other: x for other, x in kept.items() if other is not c}

@@ -295,8 +295,42 @@ def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(bett
     )
     fit = lambda setting, steps=0: Set(setting=setting, score=groups(-gain if setting else 0.0))
     gains = dict(zip(names, (*better, 99.0)))
-    worse = lambda nominal, setting, uncounted: gains[min(setting)] if uncounted == 1 else np.nan
+    handed = {"gain": (0.9,)}
+    worse = lambda before, setting, uncounted: gains[min(setting)] if before is handed else np.nan
     decides = SimpleNamespace(worse=worse, scattered=lambda: 1.0)
-    outcome = SimpleNamespace(dependences=left)
+    outcome = SimpleNamespace(dependences=left, handed=SimpleNamespace(setting=handed))
     curve = estimator._best_curve(SimpleNamespace(fit=fit), outcome, decides)
     assert curve == ({chosen: (1.0,)} if chosen else None)
+
+
+@pytest.mark.parametrize(
+    "names, left, curve, takes, handed",
+    [
+        ({}, 0.0, True, True, True),
+        ({"gain": 0.9}, 0.5, True, True, True),
+        ({"gain": 0.9}, 0.1, True, True, False),  # the name is earned
+        (
+            {"gain": 0.9},
+            np.nan,
+            True,
+            True,
+            False,
+        ),  # in a joint in which hardly anything is missing
+        ({"gain": 0.9}, 0.5, False, True, False),  # no curve predicts better
+        ({"gain": 0.9}, 0.5, True, False, False),  # kept-back recordings speak against it
+    ],
+)
+def test_a_curve_takes_the_place_of_names_that_leave_much(
+    monkeypatch, names, left, curve, takes, handed
+):
+    monkeypatch.setattr(estimator, "physics", lambda setting: set(setting))
+    monkeypatch.setattr(estimator, "share_left", lambda fitted: np.array([np.nan, left]))
+    monkeypatch.setattr(estimator, "_best_curve", lambda *given: {"curve": 1.0} if curve else None)
+    handing = lambda setting, gone: estimator.Handed(setting, None, None, {}, gone)
+    accepted = lambda setting: handing(setting if takes else {}, [])
+    before = handing(names, ["delay"])
+    outcome = SimpleNamespace(fitted=SimpleNamespace(setting=names), handed=before)
+    judge = SimpleNamespace(fit=lambda setting, steps: SimpleNamespace(setting=setting))
+    estimator._curve_instead(judge, outcome, None, accepted)
+    assert outcome.handed.gone == ["delay"]
+    assert outcome.fitted.setting == outcome.handed.setting == ({"curve": 1.0} if handed else names)
