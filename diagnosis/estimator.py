@@ -278,12 +278,13 @@ def _keep(judge, outcome):
         outcome.fitted = judge.fit(outcome.handed.setting, steps=0)
 
 
-def _curve_instead(judge, outcome, decides, accepted):
-    """Hand over a curve where nothing has a name or names leave much, and it predicts better."""
+def _curve_instead(judge, outcome, decides, kept_of):
+    """Hand over a curve where nothing has a name or names leave much, and it predicts better.
+    kept_of(setting): the Handed of what kept-back recordings leave of it."""
     if physics(outcome.fitted.setting) and not (share_left(outcome.fitted) > NEAREST).any():
         return
     curve = _best_curve(judge, outcome, decides)
-    handed = accepted(curve) if curve else None
+    handed = kept_of(curve) if curve else None
     if handed and handed.setting:
         outcome.handed = replace(handed, gone=outcome.handed.gone)
         _keep(judge, outcome)

@@ -80,6 +80,11 @@ class Ahead:
         self.spread = FREE * np.concatenate([trajectory.qpos_sd[rows], trajectory.qvel_sd[rows]], 1)
         self.base, self._freedom = setting or {}, None
 
+    @property
+    def known_noise(self):
+        """(nv,): the noise; infinite where none is known, so that errors there tell nothing."""
+        return np.where(np.isfinite(self.noise), self.noise, np.inf)
+
     def heavier(self, setting, options):
         """(columns, nv): share of its inertia that a unit of each column of Options adds to a
         joint, where columns leave that out: none, for here they are simulated."""

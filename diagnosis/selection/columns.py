@@ -108,8 +108,7 @@ class Columns:
     def _turned(self, option):
         """(option, amounts (p, p), Start along them) of what columns of an option tell apart; None
         where they tell all of it well."""
-        noise = np.where(np.isfinite(self.ahead.noise), self.ahead.noise, np.inf)
-        each = [(self.parts[k] / noise).ravel() for k in option.columns]
+        each = [(self.parts[k] / self.ahead.known_noise).ravel() for k in option.columns]
         size, ways = np.linalg.svd(np.stack(each, -1), full_matrices=False)[1:]
         if size[-1] > SLIGHT * size[0]:
             return None
@@ -184,8 +183,9 @@ class Columns:
 
     def _shows(self, change):
         """Whether a column says anything: more than rounding, beside the noise."""
-        noise = np.where(np.isfinite(self.ahead.noise), self.ahead.noise, np.inf)
-        return bool((np.sqrt(np.mean(change**2, axis=(0, 1))) > 1e-6 * noise).any())
+        return bool(
+            (np.sqrt(np.mean(change**2, axis=(0, 1))) > 1e-6 * self.ahead.known_noise).any()
+        )
 
     def more(self, starts):
         """These Columns and those of further starts."""

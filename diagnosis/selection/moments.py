@@ -155,7 +155,6 @@ def sharpened(judge, fitted):
 def removed(before, after, when):
     """Share of the error of a Fitted set that another one removes while a condition holds."""
     ahead = after.columns.ahead
-    noise = np.where(np.isfinite(ahead.noise), ahead.noise, np.inf)
     acts = lambda w: (
         when["recording"] in (None, w.recording.name)
         and (
@@ -164,7 +163,7 @@ def removed(before, after, when):
         )
     )
     inside = np.array([acts(w) for w in ahead.windows])
-    error = lambda f: np.sqrt(np.mean((f.columns.residual[inside] / noise) ** 2))
+    error = lambda f: np.sqrt(np.mean((f.columns.residual[inside] / ahead.known_noise) ** 2))
     return float(1 - error(after) / error(before))
 
 

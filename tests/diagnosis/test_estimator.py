@@ -296,7 +296,10 @@ def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(bett
     fit = lambda setting, steps=0: Set(setting=setting, score=groups(-gain if setting else 0.0))
     gains = dict(zip(names, (*better, 99.0)))
     handed = {"gain": (0.9,)}
-    worse = lambda before, setting, uncounted: gains[min(setting)] if before is handed else np.nan
+    asked = lambda before, uncounted: before is handed and uncounted == 1
+    worse = lambda before, setting, uncounted: (
+        gains[min(setting)] if asked(before, uncounted) else np.nan
+    )
     decides = SimpleNamespace(worse=worse, scattered=lambda: 1.0)
     outcome = SimpleNamespace(dependences=left, handed=SimpleNamespace(setting=handed))
     curve = estimator._best_curve(SimpleNamespace(fit=fit), outcome, decides)
@@ -309,13 +312,7 @@ def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(bett
         ({}, 0.0, True, True, True),
         ({"gain": 0.9}, 0.5, True, True, True),
         ({"gain": 0.9}, 0.1, True, True, False),  # the name is earned
-        (
-            {"gain": 0.9},
-            np.nan,
-            True,
-            True,
-            False,
-        ),  # in a joint in which hardly anything is missing
+        ({"gain": 0.9}, np.nan, True, True, False),  # hardly anything is missing there
         ({"gain": 0.9}, 0.5, False, True, False),  # no curve predicts better
         ({"gain": 0.9}, 0.5, True, False, False),  # kept-back recordings speak against it
     ],

@@ -285,12 +285,14 @@ def test_a_stop_on_a_side_where_none_is_met_is_no_finding(search, shown, left):
     assert changing(judge, stopped).setting == ({stop: left} if left else {})
 
 
-def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
+def rounds(search, monkeypatch, something):
+    """(Fitted without effects, Fitted that every round ends with, asked): a search whose rounds are
+    written down in asked; something(now): whether anything is left."""
     nothing, best, asked = fitted(search, [], 0.0), fitted(search, ["armature"], -1.0), []
     judge = SimpleNamespace(fit=lambda setting, **how: best if setting else nothing)
     monkeypatch.setattr(search, "begin", lambda *given: judge)
     monkeypatch.setattr(search, "locate", lambda setting: ("located", "first"))
-    monkeypatch.setattr(search, "something", lambda now: True)
+    monkeypatch.setattr(search, "something", something)
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
 
     def round_of(judge, now, curves):
@@ -299,6 +301,11 @@ def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
 
     monkeypatch.setattr(search, "_round", round_of)
     monkeypatch.setattr(search, "_curves", lambda setting: "curves")
+    return nothing, best, asked
+
+
+def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
+    nothing, best, asked = rounds(search, monkeypatch, lambda now: True)
     found = search.run()
     assert asked == [(nothing, "curves"), (best, "curves")] and found.fitted is best
     assert (found.trajectory, found.first) == ("moved", "first")
@@ -307,19 +314,12 @@ def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
 
 
 def test_no_round_follows_a_set_beside_which_a_perfect_simulator_is_no_better(search, monkeypatch):
-    nothing, best, asked = fitted(search, [], 0.0), fitted(search, ["armature"], -1.0), []
-    judge = SimpleNamespace(fit=lambda setting, **how: best if setting else nothing)
-    monkeypatch.setattr(search, "begin", lambda *given: judge)
-    monkeypatch.setattr(search, "locate", lambda setting: ("located", "first"))
-    monkeypatch.setattr(search, "something", lambda now: now is not best)
-    monkeypatch.setattr(search, "_round", lambda judge, now, curves: asked.append(now) or best)
-    monkeypatch.setattr(search, "_curves", lambda setting: "curves")
+    nothing, best, asked = rounds(search, monkeypatch, lambda now: now is nothing)
     monkeypatch.setattr(identification, "MissingForce", lambda *given: "missing")
     monkeypatch.setattr(identification, "carried", lambda judge, sets, now, best: ["sets"])
-    search.smoother = SimpleNamespace(locate=lambda *given, **how: "moved")
-    search.usual = search.screen = None
+    search.screen = None
     found = search.run()
-    assert asked == [nothing] and found.fitted is best
+    assert asked == [(nothing, "curves")] and found.fitted is best
     assert (found.missing, found.sets) == ("missing", ["sets"])
 
 
