@@ -110,7 +110,7 @@ def _undisturbed(search, found, event):
         return search, found, None
     if before < after:
         again = replace(again, fitted=again.judge.fit(found.fitted.setting))
-    here = calm.smoother.locate(again.fitted.setting, again.trajectory, passes=1)
+    here = calm.smoother.locate(again.fitted.setting, again.trajectory)
     return calm, replace(again, trajectory=here), event
 
 
@@ -165,7 +165,7 @@ def _instead(search, found, fitted, names, joint):
     """The Fitted set with the curve that the force at a joint follows best in the place of what
     acts there, or None where it follows nothing."""
     rest = {c: v for c, v in fitted.setting.items() if c not in names}
-    trajectory = copy(found.smoother).locate(rest, found.trajectory, passes=1)
+    trajectory = copy(found.smoother).locate(rest, found.trajectory)
     follows = missing_force.dependences(search.world, trajectory, search.train)
     curve = next((d for d in follows if d.joint == joint), None)
     if not curve:
@@ -198,7 +198,7 @@ def _nameless(search, outcome):
     outcome.lacks = lacking(finer)
     if finer is not outcome.fitted:
         given = finer.setting, outcome.trajectory
-        trajectory = copy(outcome.found.smoother).locate(*given, passes=1)
+        trajectory = copy(outcome.found.smoother).locate(*given)
         outcome.left = missing_force.dependences(search.world, trajectory, search.train)
 
 
@@ -258,12 +258,12 @@ def _refitted(search, outcome, decides, log, some, out):
     return _earned(search, judge, fitted).setting  # what was earned beside it goes, too
 
 
-def _best_curve(judge, outcome, decides):
-    """The setting of a curve that the force at a joint follows, worth the price of a force without
-    a name, where a Check says that it predicts better than what is handed over by more than noise
-    does, without the window that says so most; None where there is none."""
+def _best_curve(judge, outcome, decides, curves):
+    """The setting of one of the curves that the forces at some joints follow, worth the price of a
+    force without a name, where a Check says that it predicts better than what is handed over by
+    more than noise does, without the window that says so most; None where there is none."""
     nothing, handed = judge.fit({}), outcome.handed.setting
-    for rest in missing_force.each_joint(outcome.dependences)[:2]:
+    for rest in curves:
         curve = judge.fit({rest.candidate: rest.values}, steps=2)
         step = paired(nothing.score, curve.score)
         told = step.gain > PRICE * UNNAMED and step.p_value < LEVEL
@@ -279,11 +279,15 @@ def _keep(judge, outcome):
 
 
 def _curve_instead(judge, outcome, decides, kept_of):
-    """Hand over a curve where nothing has a name or names leave much, and it predicts better.
-    kept_of(setting): the Handed of what kept-back recordings leave of it."""
-    if physics(outcome.fitted.setting) and not (share_left(outcome.fitted) > NEAREST).any():
-        return
-    curve = _best_curve(judge, outcome, decides)
+    """Hand over a curve where nothing has a name, or at a joint where names leave much, and it
+    predicts better. kept_of(setting): the Handed of what kept-back recordings leave of it."""
+    model, fitted = judge.ahead.model, outcome.fitted
+    curves = missing_force.each_joint(outcome.dependences)
+    if physics(fitted.setting):
+        shares = share_left(fitted)
+        dof = lambda curve: model.joint(curve.joint).dofadr[0]
+        curves = [c for c in curves if shares[channel(fitted, dof(c))] > NEAREST]
+    curve = _best_curve(judge, outcome, decides, curves[:2])
     handed = kept_of(curve) if curve else None
     if handed and handed.setting:
         outcome.handed = replace(handed, gone=outcome.handed.gone)
@@ -313,7 +317,7 @@ def _hand_over(search, held, kept_back, outcome, log):
         outcome.p_values[c] = paired(less.score, outcome.fitted.score).p_value
         outcome.strains[c] = _strain(c, v, plausible(c, found.usual))
     if set(kept) != set(found.fitted.setting):
-        outcome.trajectory = found.smoother.locate(kept, outcome.trajectory, passes=1)
+        outcome.trajectory = found.smoother.locate(kept, outcome.trajectory)
         outcome.left = missing_force.dependences(world, outcome.trajectory, search.train)
     check.locate(kept)
     outcome.held_check = check

@@ -90,12 +90,11 @@ class Check:
         predicted = files.predicted(model, self.windows)
         return windowing.error(model, self.windows, predicted, self.noise)
 
-    def smoothed(self, setting, near=False):
+    def smoothed(self, setting):
         """The windows, begun at the motion that is located under a setting: noise of start states
         as recorded moves a prediction by more than many an effect does, and so do those that
-        another setting located. near: to the setting that was asked for last (see Smoother)."""
-        passes = 2 if self.path else 3
-        self.path = copy(self.smoother).locate(setting, self.path, passes, near)
+        another setting located."""
+        self.path = copy(self.smoother).locate(setting, self.path)
         path, begun = self.path, {}
         for r in self.recordings:
             rows = path.rows(r)
@@ -109,14 +108,12 @@ class Check:
         known = windowing.known(self.world.model, self.windows)[:, 1:]
         return SCATTER * np.sqrt(2 * known[..., self.told].sum()) / max(known.sum(), 1)
 
-    def squares(self, files, setting, near=False):
+    def squares(self, files, setting):
         """Parts of the squared error of the Files of a setting (2, W), by window: from start states
         as recorded, and as they are smoothed under it; infinite where they do not run. What the
         files do not hold of sensors that are off is undone in both, and in what is measured."""
         off = {c: v for c, v in setting.items() if files.forms[c] == "measurement"}
-        both = [
-            self._undone(windows, off) for windows in (self.windows, self.smoothed(setting, near))
-        ]
+        both = [self._undone(windows, off) for windows in (self.windows, self.smoothed(setting))]
         return np.array([self._parts(files, windows, both[0]) for windows in both])
 
     def _undone(self, windows, off):
@@ -161,7 +158,7 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
         rest = {o: {c: v for c, v in setting.items() if c is not o} for o in setting}
         less = {out: Files.of(world, others) for out, others in rest.items()}
         worse = {
-            c: _worse(after, check.squares(less[c], rest[c], near=True), uncounted=1)
+            c: _worse(after, check.squares(less[c], rest[c]), uncounted=1)
             for c in setting
             if files.forms[c] in ("mjcf", "python")
         }
@@ -208,7 +205,8 @@ def in_stock_mujoco(model, nominal, windows):
         mine = {w.first: k for k, w in enumerate(windows) if w.recording is recording}
         last = max(windows[k].last for k in mine.values())
         data, now, start = mujoco.MjData(model), None, 0
-        _hold(model, data, drives, np.nan_to_num(recording.ctrl[0, inputs]))
+        control = np.nan_to_num(recording.ctrl[:, inputs])
+        _hold(model, data, drives, control[0])
         for row in range(last + 1):
             if now is not None and row <= windows[now].last:
                 out[now, row - start] = data.qpos[q]
@@ -217,7 +215,7 @@ def in_stock_mujoco(model, nominal, windows):
                 data.qpos[q], data.qvel[v] = begun[0][now], begun[1][now]
                 out[now, 0] = begun[0][now]
             if row < last:
-                data.ctrl[drives] = np.nan_to_num(recording.ctrl[row, inputs])
+                data.ctrl[drives] = control[row]
                 gap = recording.time[row + 1] - recording.time[row]
                 count, model.opt.timestep = divided(gap, length)  # as corrected.py
                 mujoco.mj_step(model, data, nstep=count)

@@ -128,11 +128,12 @@ class Ahead:
         gap = residual - other.residual([setting])[0] + noise * rng.standard_normal(residual.shape)
         return np.where(self.known, gap, 0.0)
 
-    def rough(self, settings):
+    def rough(self, settings, begun=None):
         """As of residual(), for columns, which are differences of two of these: what a coarse step
-        or a simple integrator does wrong it does in both."""
+        or a simple integrator does wrong it does in both. begun: see World.simulate."""
         some, qvel = [*map(self.roughly, settings)], np.tile(self.qvel, (len(settings), 1))
-        return self._simulated(self.world.quick, some, qvel)
+        begun = begun and self.roughly(begun)
+        return self._simulated(self.world.quick, some, qvel, begun=begun)
 
     def same(self, setting):
         """Whether rough() simulates a setting as residual() does."""
@@ -142,10 +143,10 @@ class Ahead:
         """A setting with the time step of columns."""
         return {**with_own_step(setting), **self.coarse}
 
-    def _simulated(self, world, settings, qvel, refine=1):
+    def _simulated(self, world, settings, qvel, refine=1, begun=None):
         n, each = len(settings), [s for s in settings for _ in self.windows]
         starts = np.tile(self.qpos, (n, 1)), qvel
-        qpos = world.simulate(each, *starts, self.windows * n, refine)[0]
+        qpos = world.simulate(each, *starts, self.windows * n, refine, begun=begun)[0]
         return self._gaps(qpos.reshape(n, len(self.windows), *qpos.shape[1:]))
 
     def _gaps(self, qpos):

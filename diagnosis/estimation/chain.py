@@ -9,6 +9,8 @@ Where an effect is the missing one, what it does in a row is what is missing the
 size: both run on through the same linear transitions.
 """
 
+from functools import partial
+
 import mujoco
 import numpy as np
 
@@ -91,9 +93,10 @@ class Chain(Ahead):
         """Measured less predicted, (settings, W, T, nv), as of Ahead."""
         return self._predicted(settings, Ahead.residual)
 
-    def rough(self, settings):
+    def rough(self, settings, begun=None):
         """As of Ahead."""
-        return self._predicted([with_own_step(s) for s in settings], Ahead.rough)
+        simulate = partial(Ahead.rough, begun=begun and with_own_step(begun))
+        return self._predicted([with_own_step(s) for s in settings], simulate)
 
     def _predicted(self, settings, simulate):
         """simulate: the method of Ahead by which windows are simulated that are not carried on."""

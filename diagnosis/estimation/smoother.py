@@ -17,15 +17,16 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from diagnosis.effects.base import HINGE, SLIDE
+from diagnosis.effects.base import HINGE, SLIDE, runge_kutta
 from diagnosis.effects.environment import collides
 from diagnosis.estimation import windowing
 from diagnosis.estimation.kalman import smooth
 from diagnosis.estimation.readings import behind, later, measurement_noise, shown
-from diagnosis.simulation.rows import RowMap
+from diagnosis.simulation.rows import RowMap, coarse
 
 BLOCK, LEAD = 200, 40  # rows that are smoothed as one piece, and beside them on either side
-PASSES, UPDATES = 3, 3  # Gauss-Newton passes of a first call, variance updates in each
+PASSES = 3, 2  # of Gauss-Newton, from the recordings, and from another trajectory
+UPDATES = 3  # of the variances in each
 MOST = 10.0  # factor of a variance in one update
 LOUDER = 20.0  # noise is at most so many times what differences of readings show
 REACH = 2.0  # deviations of a position, within which something may touch
@@ -101,7 +102,7 @@ class Smoother:
         self._blocks(starts)
         self.floor = self._floors(recordings)
         self.R = self.floor.copy()
-        self.scale = self._scale()
+        self.scale, self.coarse = self._scale(), coarse(world, recordings)
         self.walk = (WANDERS * self.scale) ** 2 / 0.1
         self.position_noise, self.velocity_noise = self._noise()
 
@@ -147,13 +148,10 @@ class Smoother:
         scale = np.mean(held, axis=0) + model.dof_M0 * (speed + 1e-3) / 0.2
         return np.maximum(scale, 1e-3 * scale.max())
 
-    def locate(self, setting, trajectory=None, passes=PASSES, near=False):
-        """The Trajectory under a setting {Candidate: values}, begun at another one if given.
-
-        near: to one of a similar setting, whose transitions are taken over, for they cost most:
-        where the motion goes is the setting's all the same.
-        """
+    def locate(self, setting, trajectory=None, passes=None):
+        """The Trajectory under a setting {Candidate: values}, begun at another one if given."""
         rows = RowMap(self.world, self.recordings, setting)
+        few = RowMap(self.world, self.recordings, {**self.coarse, **setting})
         if trajectory is None:
             qpos, qvel, force = self.qpos, self.qvel, np.zeros_like(self.qvel)
         else:
@@ -164,9 +162,9 @@ class Smoother:
         told = (later(*off, x) for x in (self.position, self.velocity))
         seen = *behind(*off, self.qpos, self.qvel), *told
         qpos_sd = np.sqrt(self.R[: self.model.nv]) if trajectory is None else trajectory.qpos_sd
-        for _ in range(passes):
+        for _ in range(passes or PASSES[trajectory is not None]):
             free = touching(self.model, qpos, REACH * qpos_sd)
-            step = self._linear(rows, qpos, qvel, force, free, trajectory if near else None)
+            step = self._linear((rows, few), qpos, qvel, force, free)
             for _ in range(UPDATES):
                 found = self._smooth(step, qpos, qvel, seen, ~free)
                 self._update(found, ~free)
@@ -187,22 +185,21 @@ class Smoother:
         args = qpos, qvel, force, *sd, self.first, free, split[0], rows.case.step, split[1]
         return Trajectory(*args)
 
-    def _linear(self, rows, qpos, qvel, force, free, like):
+    def _linear(self, maps, qpos, qvel, force, free):
         """(A, c, extra, seconds) of every row that has a next one: transitions of (q, v, w) about a
-        trajectory, or of another one like it, if not None; extra velocity variance; its length."""
-        model, nv = self.model, self.model.nv
+        trajectory; extra velocity variance; its length. maps: RowMaps in the simulator's steps,
+        which tell where the motion goes, and in few of them, for how small changes go on."""
+        model, nv, (rows, few) = self.model, self.model.nv, maps
         now = ~self.last
-        if like is None:
-            q, v, A, B = rows.linearised(qpos[now], qvel[now], force[now], self.scale, free[now])
-        else:
-            q, v = rows.ahead(np.arange(now.sum()), qpos[now], qvel[now], force[now])
-            A, B = like.transition[now].copy(), like.driven[now].copy()
+        q, v = rows.ahead(np.arange(now.sum()), qpos[now], qvel[now], force[now])
+        A, B = few.linearised(qpos[now], qvel[now], force[now], self.scale, free[now])
+        if not runge_kutta(model):
+            A, B = _in_own_steps(A, B, (few.case.step - rows.case.step) / 2 / rows.seconds)
         n, after = len(q), np.flatnonzero(now) + 1
         with np.errstate(invalid="ignore", over="ignore"):
             moved = windowing.difference(model, qpos[after], q), v - qvel[after]
             drift = np.concatenate(moved, 1) - np.einsum("nij,nj->ni", B, force[now])
         bad = free[now] | ~np.isfinite(drift).all(1) | ~np.isfinite(A).all((1, 2))
-        bad |= ~B.any((1, 2))  # where another one glides
         seconds = rows.seconds[bad]
         A[bad], B[bad] = np.eye(2 * nv), 0.0
         A[bad, :nv, nv:] = np.eye(nv) * seconds[:, None, None]
@@ -252,6 +249,19 @@ class Smoother:
         moved = apart.mean() * self.R * ratio(found.measurement) + (~apart).mean() * self.floor
         moved = np.clip(moved, self.floor, LOUDER**2 * self.floor)
         self.R = np.where(known, moved, self.R)
+
+
+def _in_own_steps(A, B, share):
+    """Transitions in few steps as they are in the simulator's own. Where positions move by a step's
+    new velocity, a velocity is that of half a step before its time. share (n,): by how much more of
+    the row that is in few steps."""
+    nv = B.shape[2]
+    same, ends = np.eye(3 * nv), np.zeros((len(A), nv, 3 * nv))
+    ends[:, :, 2 * nv :] = np.eye(nv)
+    whole = np.concatenate([np.concatenate([A, B], 2), ends], 1)
+    sooner = np.zeros_like(whole)
+    sooner[:, nv : 2 * nv] = share[:, None, None] * (whole - same)[:, nv : 2 * nv]
+    return np.split(((same + sooner) @ whole @ (same - sooner))[:, : 2 * nv], [2 * nv], axis=2)
 
 
 def _measured_velocity(model, recording):

@@ -8,6 +8,7 @@ An option is a Start with its columns: one for each parameter, or one for a whol
 
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.linalg import inv
@@ -98,10 +99,10 @@ class Columns:
             if not turned:
                 break
             rough = self._rough() if rough is None else rough
-            changes = iter(self._changes(self.ahead.rough, rough, [start for *_, start in turned]))
+            changes = self._physics([start for *_, start in turned], rough)
             for option, ways, start in turned:
-                own = np.stack([next(changes) for _ in start.directions])
-                for k, part in zip(option.columns, np.einsum("ij,j...->i...", inv(ways), own)):
+                own = np.einsum("ij,j...->i...", inv(ways), np.stack(changes[start]))
+                for k, part in zip(option.columns, own):
                     self.parts[k] = part
             some = [option for option, *_ in turned]
 
@@ -147,10 +148,9 @@ class Columns:
         physics = sorted((s for s in starts if not s.candidate.effect.numerical), key=dear)
         steps = [start for start in starts if start.candidate.effect.numerical]
         rough = self._rough() if physics else self.residual
-        changes = self._changes(ahead.rough, rough, physics)
-        changes = iter(changes + self._changes(ahead.residual, self.residual, steps))
-        for start in physics + steps:
-            own = [next(changes) for _ in start.directions]
+        changes = self._physics(physics, rough)
+        changes |= self._changes(ahead.residual, self.residual, steps)
+        for start, own in changes.items():
             seen = np.array([self._shows(c) for c in own])
             self._remember(start, seen)
             if not seen.any() or (start.merges and not seen.all()):
@@ -160,8 +160,17 @@ class Columns:
             shown = {f: getattr(start, f)[seen] for f in ("directions", "low", "high")}
             self.options.append(Option(**vars(start) | shown, columns=columns, start=start))
 
+    def _physics(self, starts, rough):
+        """_changes() in quick simulations. Beside the setting, what recordings do not show begins
+        as the setting alone has it."""
+        inside = [start for start in starts if start.candidate in self.setting]
+        beside = [start for start in starts if start.candidate not in self.setting]
+        changes = self._changes(self.ahead.rough, rough, inside)
+        residual = partial(self.ahead.rough, begun=self.setting)
+        return changes | self._changes(residual, rough, beside)
+
     def _changes(self, residual, base, starts):
-        """[(W, T, nv)] of all directions of starts: base, less the residual with them."""
+        """{start: [(W, T, nv)] of its directions}: base, less the residual with them."""
         settings = [setting for start in starts for setting in start.settings(self.setting)]
         changes = []
         for k in range(0, len(settings), TOGETHER):
@@ -171,7 +180,8 @@ class Columns:
                 gone = self.lost | (abs(gap) >= self.ahead.travel) | ~np.isfinite(change)
                 changes.append(np.where(gone, np.float32(0.0), change))
         self.simulated += len(settings)
-        return changes
+        each = iter(changes)
+        return {start: [next(each) for _ in start.directions] for start in starts}
 
     def _remember(self, start, shows):
         """Keep which parameters of a candidate show: later columns leave out the others."""

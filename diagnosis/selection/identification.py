@@ -79,14 +79,14 @@ class Identification:
             if fitted.setting.keys() == setting.keys():
                 break
             setting = fitted.setting
-            trajectory = self.smoother.locate(setting, trajectory, passes=1)
+            trajectory = self.smoother.locate(setting, trajectory)
         known = trajectory, first, self.smoother, self.usual, judge
         return Found(fitted, *known, self.missing, self.ranking, self.sets)
 
     def again(self, setting, trajectory):
         """The Fitted set of one more round, without curves, from a setting and a trajectory of one
         like it."""
-        trajectory, self.sets = self.smoother.locate(setting, trajectory, passes=1), []
+        trajectory, self.sets = self.smoother.locate(setting, trajectory), []
         judge = self.begin(setting, trajectory)
         return self._round(judge, judge.fit(setting), [])
 
@@ -105,7 +105,7 @@ class Identification:
         self.smoother = smoother = Smoother(self.world, self.train)
         first = trajectory = smoother.locate({})
         if setting:
-            trajectory = smoother.locate(setting, first, passes=1)
+            trajectory = smoother.locate(setting, first)
         known = first.located()[0], (first.qpos, first.qvel), first.force
         self.usual = Usual(self.world, self.train, smoother.scale, *known)
         ahead = Ahead(self.world, cut_ahead(self.train), smoother.position_noise)
@@ -124,7 +124,7 @@ class Identification:
     def begun(self, judge, setting):
         """A Judge like another one, of windows that begin at the motion located under a setting."""
         ahead = copy(self.ahead)
-        ahead.start(copy(self.smoother).locate(setting, self.trajectory, passes=2), setting)
+        ahead.start(copy(self.smoother).locate(setting, self.trajectory), setting)
         return Judge(ahead, self.usual, judge.reference, self.seen)
 
     def _round(self, judge, now, curves):

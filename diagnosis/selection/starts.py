@@ -182,11 +182,12 @@ def _ladder(base, prior):
 
 
 def _both_ways(base, prior):
-    """A usual size of each parameter that may go either way: where something touches, a small step
-    tells of what it makes and breaks."""
+    """A usual size of each parameter that may go either way, or all there is of it: where something
+    touches, a small step tells of what it makes and breaks."""
     usual = np.where(np.isfinite(prior.scale) & (base > prior.low), prior.scale, 0.0)
     rows = np.diag(usual)[usual > 0]
-    return [base + way * row for row in rows for way in WAYS]
+    ends = [np.clip(base + way * row, prior.low, prior.high) for row in rows for way in WAYS]
+    return [values for values in ends if (values != base).any()]
 
 
 def _proportional(candidate, base, prior, shown):

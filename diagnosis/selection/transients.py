@@ -342,7 +342,7 @@ class Local:
         predicted as far where it was not fitted, or another setting."""
         scene = self.scene
         some = [c for c in curves if "time" not in c.variables and c.share >= LASTING]
-        every = [{**scene.setting, c.candidate: c.values} for c in some] + [setting or {}]
+        every = [setting or {}] + [{**scene.setting, c.candidate: c.values} for c in some]
         for other in filter(None, every):
             column = scene.plain - scene.left([other])[0]
             if (column * scene.plain).sum() ** 2 > LASTING * gain * (column**2).sum() > 0:

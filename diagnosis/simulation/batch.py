@@ -79,7 +79,8 @@ class Engine:
         n, act = len(cases), None
         qpos, qvel = np.tile(self.model.qpos0, (n, 1)), np.zeros((n, self.model.nv))
         if self.model.nq > self.nominal.nq or self.hidden.any():
-            qpos, qvel, act = run_up(self, cases, windows, begin, measures, step)
+            followed = [case.followed for case in cases]
+            qpos, qvel, act = run_up(self, followed, windows, begin, measures, step)
         qpos[:, self.q], qvel[:, self.v] = self.true(*shown, measures)
         return qpos, qvel, act
 

@@ -264,18 +264,14 @@ class RowMap:
         return out
 
     def linearised(self, qpos, qvel, force, scale, skipped):
-        """What comes out of every row, and its derivatives by forward differences.
+        """Derivatives of what comes out of every row, by forward differences.
 
         qpos (n, nq), qvel (n, nv), force (n, nv) at the rows of `begin`; scale (nv,): usual forces;
         skipped (n,): rows of which nothing is asked, and NaN told.
-        Returns qpos (n, nq), qvel (n, nv), A (n, 2 nv, 2 nv), B (n, 2 nv, nv) in tangent
-        coordinates.
+        Returns A (n, 2 nv, 2 nv), B (n, 2 nv, nv) in tangent coordinates.
         """
         n, nv, asked = len(self.begin), self.model.nv, np.flatnonzero(~skipped)
-        out = [
-            np.full(shape, np.nan)
-            for shape in ((n, self.nominal.nq), (n, nv), (n, 2 * nv, 2 * nv), (n, 2 * nv, nv))
-        ]
+        out = [np.full((n, 2 * nv, width), np.nan) for width in (2 * nv, nv)]
         if len(asked):
             found = self._differences(asked, qpos[asked], qvel[asked], force[asked], scale)
             for whole, part in zip(out, found):
@@ -301,7 +297,7 @@ class RowMap:
             q1, v1 = self.ahead(index, *moved)
             block[:, :nv, k] = difference(self.nominal, q, q1) / eps
             block[:, nv:, k] = (v1 - v) / eps
-        return q, v, A, B
+        return A, B
 
 
 def _alike(needed):

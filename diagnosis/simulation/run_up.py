@@ -18,7 +18,7 @@ from diagnosis.common.coordinates import difference, states
 from diagnosis.common.distributions import f_sf
 
 RETURN = 0.1  # seconds between returns to the record
-SETTLE = 1.0  # seconds whose returns tell how what is hidden began
+SETTLE = 0.5  # seconds whose returns tell how what is hidden began
 EARLIER = 2.0  # seconds before a window, from which on what is hidden is followed
 LEVEL = 0.01  # of chance, below which it is taken to have begun elsewhere than at rest
 SMALL = 0.1, 1e-6  # step of differences: share of what a hidden state moves, and at least

@@ -153,7 +153,9 @@ class World:
         engine = self.engine(frozenset([candidate]))
         return engine.model.nv > self.model.nv or bool(engine.hidden.any())
 
-    def simulate(self, settings, start_qpos, start_qvel, windows, refine=1, sensors=False):
+    def simulate(
+        self, settings, start_qpos, start_qvel, windows, refine=1, sensors=False, begun=None
+    ):
         """Predict what the sensors show in S windows, each under its own setting.
 
         settings: S dicts {Candidate: values}, values being the candidate's parameters in
@@ -166,6 +168,9 @@ class World:
             the first row: its control, for ever).
         refine: divide the simulator's time step by this integer.
         sensors: also predict the model's sensors.
+        begun: a setting under which what recordings do not show (bristles, plays, springs) is
+            followed up to each window's first row, for simulations whose hidden states are its own
+            too; else each simulation's own setting.
 
         Returns qpos (S, T, nq), qvel (S, T, nv), and with `sensors` sensordata (S, T,
         nsensordata), at the rows of each window, T the most rows of any; row 0 of qpos and
@@ -178,10 +183,12 @@ class World:
             np.full((len(windows), rows, n), np.nan)
             for n in (self.model.nq, self.model.nv, self.model.nsensordata)
         ]
-        cases, groups = {}, {}
+        cases, groups, first = {}, {}, begun and Case(self.model, begun, refine)
         for s, setting in enumerate(settings):
             if id(setting) not in cases:
-                cases[id(setting)] = Case(self.model, setting, refine)
+                cases[id(setting)] = case = Case(self.model, setting, refine)
+                if first and (first.structure, first.step) == (case.structure, case.step):
+                    case.followed = first
             case = cases[id(setting)]
             groups.setdefault((case.structure, case.step, case.stepwise, case.late), []).append(
                 (s, case)
@@ -308,7 +315,7 @@ def step_of(model, setting):
 class Case:
     """One setting, resolved: `on` [(candidate, values)] in the order of the catalogue, without
     those at their nominal values; `off` those that act without a condition; `when` the condition of
-    the others, if any."""
+    the others, if any; `followed` the Case under which hidden states are followed."""
 
     def __init__(self, model, setting, refine):
         order = {effect: k for k, effect in enumerate(EFFECTS)}
@@ -320,7 +327,7 @@ class Case:
         if any(when != conditions[0] for when in conditions):
             raise ValueError("effects under different conditions cannot be simulated together")
         self.when = conditions[0] if conditions else None
-        self.step = step_of(model, setting) / refine
+        self.step, self.followed = step_of(model, setting) / refine, self
         self.structure = frozenset(c for c, _ in self.on if c.effect.overrides("build"))
         place = lambda c: c.effect.id(model, c.place.name)
         self.stepwise = bool(self.when) or any(

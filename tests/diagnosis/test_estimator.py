@@ -126,7 +126,7 @@ class Search:
 
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train, self.say, self.log = world, train, say, log or (lambda line: None)
-        self.smoother = SimpleNamespace(locate=lambda setting, near, passes: (dict(setting), near))
+        self.smoother = SimpleNamespace(locate=lambda setting, near: (dict(setting), near))
 
     def run(self, setting):
         self.begun_with = setting
@@ -198,7 +198,7 @@ def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, be
     monkeypatch.setattr(estimator, "lacking", lambda fitted: fitted.setting)
     told = lambda world, trajectory, train: trajectory
     monkeypatch.setattr(estimator.missing_force, "dependences", told)
-    locate = lambda setting, near, passes: f"{near} in {setting}"
+    locate = lambda setting, near: f"{near} in {setting}"
     found = SimpleNamespace(judge=None, smoother=SimpleNamespace(locate=locate))
     fitted = SimpleNamespace(setting="usual steps")
     finer = SimpleNamespace(setting="finer steps") if better else fitted
@@ -283,26 +283,26 @@ def test_what_made_up_for_a_finding_that_goes_may_be_another_by_the_same_recordi
     [
         ((2.0, 9.0), 0.5, "first"),
         ((0.5, 9.0), 0.5, "second"),
-        ((0.5, 0.5), 0.5, None),  # no more joints are asked
+        ((0.5, 0.5), 0.5, None),
         ((2.0, 9.0), 0.1, None),  # it is not worth its price to the recordings it was fitted to
     ],
 )
 def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(better, gain, chosen):
-    names = "first", "second", "third"
+    names = "first", "second"
     left = [SimpleNamespace(joint=n, candidate=n, values=(1.0,)) for n in names]
     groups = lambda loss: Score(
         loss, loss + np.linspace(-1e-3, 1e-3, 16), 4 * np.full(16, loss), ()
     )
     fit = lambda setting, steps=0: Set(setting=setting, score=groups(-gain if setting else 0.0))
-    gains = dict(zip(names, (*better, 99.0)))
+    gains = dict(zip(names, better))
     handed = {"gain": (0.9,)}
     asked = lambda before, uncounted: before is handed and uncounted == 1
     worse = lambda before, setting, uncounted: (
         gains[min(setting)] if asked(before, uncounted) else np.nan
     )
     decides = SimpleNamespace(worse=worse, scattered=lambda: 1.0)
-    outcome = SimpleNamespace(dependences=left, handed=SimpleNamespace(setting=handed))
-    curve = estimator._best_curve(SimpleNamespace(fit=fit), outcome, decides)
+    outcome = SimpleNamespace(handed=SimpleNamespace(setting=handed))
+    curve = estimator._best_curve(SimpleNamespace(fit=fit), outcome, decides, left)
     assert curve == ({chosen: (1.0,)} if chosen else None)
 
 
@@ -320,14 +320,25 @@ def test_a_curve_is_handed_over_where_it_predicts_better_by_more_than_noise(bett
 def test_a_curve_takes_the_place_of_names_that_leave_much(
     monkeypatch, names, left, curve, takes, handed
 ):
+    tried = []
+    best = lambda judge, outcome, decides, curves: (
+        tried.extend(c.joint for c in curves) or {"curve": 1.0} if curve and curves else None
+    )
     monkeypatch.setattr(estimator, "physics", lambda setting: set(setting))
-    monkeypatch.setattr(estimator, "share_left", lambda fitted: np.array([np.nan, left]))
-    monkeypatch.setattr(estimator, "_best_curve", lambda *given: {"curve": 1.0} if curve else None)
+    monkeypatch.setattr(estimator, "share_left", lambda fitted: np.array([np.nan, left, 0.1]))
+    monkeypatch.setattr(estimator, "channel", lambda fitted, dof: dof)
+    monkeypatch.setattr(estimator, "_best_curve", best)
+    monkeypatch.setattr(estimator.missing_force, "each_joint", lambda curves: curves)
     handing = lambda setting, gone: estimator.Handed(setting, None, None, {}, gone)
     accepted = lambda setting: handing(setting if takes else {}, [])
-    before = handing(names, ["delay"])
-    outcome = SimpleNamespace(fitted=SimpleNamespace(setting=names), handed=before)
-    judge = SimpleNamespace(fit=lambda setting, steps: SimpleNamespace(setting=setting))
+    curves = [SimpleNamespace(joint=joint) for joint in (2, 1, 0)]
+    fitted, before = SimpleNamespace(setting=names), handing(names, ["delay"])
+    outcome = SimpleNamespace(fitted=fitted, handed=before, dependences=curves)
+    model = SimpleNamespace(joint=lambda joint: SimpleNamespace(dofadr=[joint]))
+    fit = lambda setting, steps: SimpleNamespace(setting=setting)
+    judge = SimpleNamespace(fit=fit, ahead=SimpleNamespace(model=model))
     estimator._curve_instead(judge, outcome, None, accepted)
+    if tried:  # at the joint of which names leave much; of none, at the first two
+        assert tried == ([1] if names else [2, 1])
     assert outcome.handed.gone == ["delay"]
     assert outcome.fitted.setting == outcome.handed.setting == ({"curve": 1.0} if handed else names)

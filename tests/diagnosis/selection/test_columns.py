@@ -1,5 +1,7 @@
 """Columns against differences of stock simulations, and what is offered at all."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -151,3 +153,18 @@ def test_a_limit_that_the_model_lacks_is_begun_at_whole_values_alone(scene):
     columns.secants(Evidence(ahead, columns.residual, columns.array))
     assert all(before[c] and count(c) == before[c] for c in limits)
     assert count(gain) > before[gain] and columns.simulated - begun == count(gain) - before[gain]
+
+
+def test_hidden_states_begin_as_the_setting_alone_has_them(scene):
+    """For columns beside it; those of its own effects follow each."""
+    world, ahead, usual = scene
+    friction, damping = (
+        world.candidate(e, "pivot") for e in ("coulomb_friction", "viscous_damping")
+    )
+    asked, other, setting = [], copy.copy(ahead), {friction: (0.05,)}
+    other.rough = lambda settings, begun=None: (
+        asked.extend((len(s), begun) for s in settings) or ahead.rough(settings, begun)
+    )
+    Columns(other, setting, Starts(world, setting, usual).of([friction, damping]))
+    assert {begun is setting for number, begun in asked if number == 2} == {True}
+    assert {begun for number, begun in asked if number == 1} == {None}

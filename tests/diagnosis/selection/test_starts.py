@@ -86,6 +86,17 @@ def test_what_goes_one_way_is_not_tried_the_other(machine):
     assert count(True) == count(False)
 
 
+def test_of_a_usual_size_all_is_taken_away_where_there_is_less(machine):
+    """Where something touches: a joint of which the model has too much damping may have none."""
+    world, usual = machine
+    damping = world.candidate("viscous_damping", "pivot")
+    (nominal,), (scale,) = damping.nominal, plausible(damping, usual).scale
+    assert 0 < nominal < scale
+    starts = Starts(world, {}, usual, touches=True).of([damping])
+    values = [float((s.base + s.directions[0])[0]) for s in starts if s.whole]
+    assert sorted(values) == pytest.approx([0.0, nominal + scale])
+
+
 def rubbing(run, waves):
     """The Trajectory of a joint whose friction has so many waves per radian."""
     angle = np.linspace(0, 40, 600)

@@ -86,7 +86,7 @@ def test_derivatives_are_central_differences_of_stock_steps(xml):
     run = uneven(model, rows=5)
     rows = RowMap(here, [run], {})
     qpos, qvel, force = some_states(model, 4)
-    q, v, A, B = rows.linearised(qpos, qvel, force, np.ones(nv), np.zeros(4, bool))
+    A, B = rows.linearised(qpos, qvel, force, np.ones(nv), np.zeros(4, bool))
 
     def moved(k, column, sign):
         state = [qpos[k].copy(), qvel[k].copy(), force[k].copy()]

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from diagnosis.recordings.recording import Recording
+from diagnosis.simulation import batch
+from diagnosis.simulation.run_up import run_up
 from diagnosis.simulation.simulator import Window, World
 
 ARM = """
@@ -82,6 +84,32 @@ def test_the_same_window_begins_alike_beside_others(world):
     both = world.simulate([setting] * 2, *starts, windows)[0]
     alone = world.simulate([setting], *(x[:1] for x in starts), windows[:1])[0]
     np.testing.assert_allclose(both[0], alone[0], atol=1e-12)
+
+
+def test_hidden_states_may_be_those_of_another_setting(world, monkeypatch):
+    """Which is followed once for all of these; an effect with states of its own follows them."""
+    setting, recording, qvel = run(world, "joint_elasticity")
+    (spring,) = setting
+    heavier = {world.candidate("armature", "elbow"): (0.03,)}
+    bristle = {world.candidate("presliding", "elbow"): VALUES["presliding"]}
+    windows, followed = [Window(recording, 70, 70 + AHEAD)], []
+    starts = recording.qpos[[70]], qvel[[70]]
+    monkeypatch.setattr(
+        batch,
+        "run_up",
+        lambda engine, cases, *more: followed.append(cases) or run_up(engine, cases, *more),
+    )
+    several = [{**setting, c: v} for c, v in heavier.items()] + [{spring: (8.1, 0.02)}, bristle]
+    apart = [world.simulate([s], *starts, windows)[0][0] for s in (setting, *several)]
+    followed.clear()
+    given = [np.repeat(x, 4, 0) for x in starts]
+    together = world.simulate([setting, *several], *given, windows * 4, begun=setting)[0]
+    own = [[c for c, _ in case.on] for cases in followed for case in cases]
+    assert own == [[spring]] * 3 + [[*bristle]]
+    assert len({id(case) for case in followed[0]}) == 1
+    for k in (0, 3):  # its own, and the bristle's
+        np.testing.assert_allclose(together[k], apart[k], atol=1e-12)
+    assert abs(together[1] - apart[1]).max() > 1e-6 < abs(together[1] - together[0]).max()
 
 
 def test_a_gap_in_the_recording_is_run_through(world):
