@@ -24,6 +24,7 @@ from diagnosis.estimation.kalman import smooth
 from diagnosis.estimation.readings import behind, later, measurement_noise, shown
 from diagnosis.simulation.rows import RowMap, coarse
 
+LONGER = 4  # times the simulator's own step, what one is at most for how small changes go on
 BLOCK, LEAD = 200, 40  # rows that are smoothed as one piece, and beside them on either side
 PASSES = 3, 2  # of Gauss-Newton, from the recordings, and from another trajectory
 UPDATES = 3  # of the variances in each
@@ -102,7 +103,9 @@ class Smoother:
         self._blocks(starts)
         self.floor = self._floors(recordings)
         self.R = self.floor.copy()
-        self.scale, self.coarse = self._scale(), coarse(world, recordings)
+        self.scale = self._scale()
+        ((step, (seconds,)),) = coarse(world, recordings).items()
+        self.few = {step: (min(seconds, LONGER * model.opt.timestep),)}
         self.walk = (WANDERS * self.scale) ** 2 / 0.1
         self.position_noise, self.velocity_noise = self._noise()
 
@@ -151,7 +154,7 @@ class Smoother:
     def locate(self, setting, trajectory=None, passes=None):
         """The Trajectory under a setting {Candidate: values}, begun at another one if given."""
         rows = RowMap(self.world, self.recordings, setting)
-        few = RowMap(self.world, self.recordings, {**self.coarse, **setting})
+        few = RowMap(self.world, self.recordings, {**self.few, **setting})
         if trajectory is None:
             qpos, qvel, force = self.qpos, self.qvel, np.zeros_like(self.qvel)
         else:
