@@ -86,7 +86,7 @@ def proposed(columns, evidence, timed):
     gains = np.array([promise(o)[1:] for o in some]).T
     comes = gains - PRICE * np.array([complexity([at(o)]) for o in some])
     best, first = np.unravel_index(np.argmax(comes), comes.shape)
-    if gains[best, first] < CLEARLY * max(lasts, default=0.0):
+    if not _clear(gains[best], lasts):
         return None, []
     when, told = each[best].when, {}
     if each[best].recording is None:
@@ -94,6 +94,12 @@ def proposed(columns, evidence, timed):
     for k in np.argsort(-comes[best]):
         told.setdefault(some[k].candidate, []).append(_under(chain.world, some[k].start, when))
     return when, [start for starts in list(told.values())[:TOLD] for start in starts[:STARTS]]
+
+
+def _clear(gains, lasts):
+    """Whether some effect promises clearly more under a condition than any name that lasts: what it
+    costs to name it says nothing of whether something comes and goes."""
+    return max(gains) >= CLEARLY * max(lasts, default=0.0)
 
 
 def _free(columns):
