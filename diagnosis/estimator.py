@@ -141,8 +141,7 @@ def _checked(search, found, fitted, others, log):
     done = fitted.setting and not search.something(fitted)
     for rest in [] if done else missing_force.each_joint(left)[:2]:
         mine = [c for c in fitted.setting if _at(world, c, rest.joint)]
-        dof = world.model.joint(rest.joint).dofadr[0]
-        if mine and not shares[channel(fitted, dof)] > NEAREST:
+        if mine and not _leave_much(world.model, fitted, shares, rest.joint):
             continue
         finer = finer or search.finer(judge, fitted)
         # where no name is found, all that is told are a joint and a variable
@@ -225,6 +224,11 @@ def _at(world, candidate, joint):
     return joints is not None and world.model.joint(joint).id in joints
 
 
+def _leave_much(model, fitted, shares, joint):
+    """Whether the names of a Fitted set leave much of a joint's error. shares: its share_left."""
+    return shares[channel(fitted, model.joint(joint).dofadr[0])] > NEAREST
+
+
 def _strain(candidate, values, prior):
     """None, or how far a value lies from what is usual."""
     far = abs(np.asarray(values) - prior.centre) / prior.scale
@@ -285,9 +289,8 @@ def _curve_instead(judge, outcome, decides, kept_of):
     curves = missing_force.each_joint(outcome.dependences)
     if physics(fitted.setting):
         shares = share_left(fitted)
-        dof = lambda curve: model.joint(curve.joint).dofadr[0]
-        curves = [c for c in curves if shares[channel(fitted, dof(c))] > NEAREST]
-    curve = _best_curve(judge, outcome, decides, curves[:2])
+        curves = [c for c in curves if _leave_much(model, fitted, shares, c.joint)]
+    curve = _best_curve(judge, outcome, decides, curves[:2]) if curves else None
     handed = kept_of(curve) if curve else None
     if handed and handed.setting:
         outcome.handed = replace(handed, gone=outcome.handed.gone)
