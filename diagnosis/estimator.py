@@ -135,7 +135,7 @@ def _checked(search, found, fitted, others, log):
     fitted = _one_curve(search, found, fitted, log)
     dependences = missing_force.dependences(world, found.first, train)
     trajectory = found.trajectory
-    left = missing_force.dependences(world, trajectory, train)
+    left = _left(search, fitted, trajectory)
     shares = share_left(fitted) if fitted.setting else None
     finer = None  # what finer steps explain as well is no force
     done = fitted.setting and not search.something(fitted)
@@ -160,13 +160,20 @@ def _checked(search, found, fitted, others, log):
     return Outcome(found, fitted, trajectory, others, {}, {}, left, dependences)
 
 
+def _left(search, fitted, trajectory):
+    """The Dependences of what a Fitted set leaves of the force, while that of it acts which comes
+    and goes."""
+    when = condition_of(fitted.setting)
+    return moments.followed(search.world, trajectory, search.train, when)
+
+
 def _instead(search, found, fitted, names, joint):
     """The Fitted set with the curve that the force at a joint follows best in the place of what
     acts there, or None where it follows nothing."""
     rest = {c: v for c, v in fitted.setting.items() if c not in names}
     trajectory = copy(found.smoother).locate(rest, found.trajectory)
-    follows = missing_force.dependences(search.world, trajectory, search.train)
-    curve = next((d for d in follows if d.joint == joint), None)
+    left = _left(search, fitted, trajectory)
+    curve = next((d for d in left if d.joint == joint), None)
     if not curve:
         return None
     return found.judge.fit({**rest, curve.candidate: curve.values}, steps=2)
@@ -198,7 +205,7 @@ def _nameless(search, outcome):
     if finer is not outcome.fitted:
         given = finer.setting, outcome.trajectory
         trajectory = copy(outcome.found.smoother).locate(*given)
-        outcome.left = missing_force.dependences(search.world, trajectory, search.train)
+        outcome.left = _left(search, finer, trajectory)
 
 
 def _beside(search, judge, fitted, rest, price):
@@ -215,7 +222,7 @@ def _beside(search, judge, fitted, rest, price):
 def _classes(search, found, fitted, log, candidates, asked=None):
     """(Fitted, {candidate: [(other, values)]}): the classes of its findings among candidates."""
     begun = lambda setting: search.begun(found.judge, setting)
-    return rivals.classes(candidates, found.judge, found.missing, fitted, begun, asked, log)
+    return rivals.classes(candidates, found.judge, found.chain, fitted, begun, asked, log)
 
 
 def _at(world, candidate, joint):
@@ -321,7 +328,7 @@ def _hand_over(search, held, kept_back, outcome, log):
         outcome.strains[c] = _strain(c, v, plausible(c, found.usual))
     if set(kept) != set(found.fitted.setting):
         outcome.trajectory = found.smoother.locate(kept, outcome.trajectory)
-        outcome.left = missing_force.dependences(world, outcome.trajectory, search.train)
+        outcome.left = _left(search, outcome.fitted, outcome.trajectory)
     check.locate(kept)
     outcome.held_check = check
     smoother = found.smoother

@@ -272,6 +272,7 @@ class Saturation(ActuatorEffect):
     """
 
     name = "saturation"
+    bounds = True
     acts_through = "control"
 
     def parameters(self, model, i):
@@ -283,10 +284,11 @@ class Saturation(ActuatorEffect):
 
     def probes(self, model, i, recordings):
         used = self.forces(model, i, recordings).max()
-        below = used * np.array([0.9, 0.7, 0.5, 0.3, 0.1, 0.03]) if used > 0 else []
         (limit,) = (p.nominal for p in self.parameters(model, i))
+        # a little above as well: what else the model lacks changes what it uses
+        below = used * np.array([1.2, 0.9, 0.7, 0.5, 0.3, 0.1, 0.03]) if used > 0 else np.zeros(0)
         above = [1.4 * limit, 2 * limit] if np.isfinite(limit) else []
-        return np.array([*below, *above])[:, None]
+        return np.array([*below[below < limit], *above])[:, None]
 
     @staticmethod
     def limits(model, i, value):

@@ -119,6 +119,7 @@ class Effect:
     loaded = True  # limit() reads qfrc_bias
     numerical = False  # the simulator's own method, no physics
     delays = False  # its one value is the time by which something is late
+    bounds = False  # its values are limits: on the way to one, nothing changes until it is met
     timed = False  # differs from a simpler effect only under a condition
     amplitudes = (
         0  # of an effect with probes: how many of its first parameters it acts in proportion to

@@ -324,6 +324,7 @@ class JointStop(JointEffect):
     """The joint is limited to [low, high], in rad or m. Source: MuJoCo's joint range."""
 
     name, simplicity = "joint_stop", 2
+    bounds = True
     acts_through = "position"
     NEVER = 1e5  # a bound that far away is never met
 

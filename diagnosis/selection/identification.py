@@ -20,7 +20,6 @@ from diagnosis.selection.beam import LEAST, Beam, likely
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.judge import Fitted, Judge, perfect, without
-from diagnosis.selection.missing_force import MissingForce, dependences
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.rivals import TIED, as_good, carried
 from diagnosis.selection.starts import Starts
@@ -37,8 +36,8 @@ TRIED = 2  # effects of a set that may be missed least, tried without
 @dataclass(frozen=True)
 class Found:
     """What the search ended with: fitted, the Fitted set; trajectory and first, smoothed under it
-    and under the nominal model; judge, on the windows begun at that trajectory; missing, the
-    MissingForce of the last round; ranking: [(candidate, loss removed alone, p-value)], most
+    and under the nominal model; judge, on the windows begun at that trajectory; chain, along it;
+    ranking: [(candidate, loss removed alone, p-value)], most
     first; sets: Fitted sets of other effects that predict as well."""
 
     fitted: Fitted
@@ -47,7 +46,7 @@ class Found:
     smoother: Smoother
     usual: Usual
     judge: Judge
-    missing: MissingForce
+    chain: Chain
     ranking: list
     sets: list
 
@@ -58,7 +57,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen, self.missing, self.sets, self.ranking = {}, None, [], []
+        self.seen, self.sets, self.ranking = {}, [], []
         self.looked = 1.0  # how many different columns a round looks at
         apart = lambda c: c.place.kind == "sensor" or c.effect.timed or c.effect.numerical
         self.candidates = [c for c in world.candidates if not apart(c)]
@@ -71,7 +70,6 @@ class Identification:
             judge = self.begin(setting, trajectory)
             now = judge.fit(setting)
             if i == ROUNDS or (i and not self.something(now)):
-                self.missing = MissingForce(self.screen, setting, self.missing)
                 fitted, self.sets = now, carried(judge, self.sets, now, now)
                 break
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
@@ -81,7 +79,7 @@ class Identification:
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory)
         known = trajectory, first, self.smoother, self.usual, judge
-        return Found(fitted, *known, self.missing, self.ranking, self.sets)
+        return Found(fitted, *known, self.screen, self.ranking, self.sets)
 
     def again(self, setting, trajectory):
         """The Fitted set of one more round, without curves, from a setting and a trajectory of one
@@ -135,9 +133,8 @@ class Identification:
         others = [c for c in self.candidates if c not in inside]
         known = self.usual, self.seen, self.trajectory, self.screen.touches
         starts = Starts(self.world, setting, *known)
-        self.missing = missing = MissingForce(self.screen, setting, self.missing)
         tried = starts.of([*setting, *others])
-        some = likely(missing, tried)
+        some = likely(self.screen, setting, tried)
         some += [starts.curve(*curve) for curve in curves]
         columns = Columns(self.screen, setting, some, seen=self.seen)
         nominal = squares(self.screen, columns.residual if not setting else None)
@@ -199,14 +196,12 @@ class Identification:
         for its place: beside one, every curve is significant, and its size decides in the end. What
         depends on the joint's own speed alone is friction of some kind: names are tried first.
         when: the condition under which they act."""
-        rows = moments.rows_of(when, self.train) if when else True
-        found = dependences(self.world, self.trajectory, self.train, rows)
+        found = moments.followed(self.world, self.trajectory, self.train, when)
         joints = [self.world.joints(c.place) or () for c in setting]
         taken = {self.world.model.joint(j).name for some in joints for j in some}
         lasts = lambda d: not when and d.variables == (f"velocity:{d.joint}",)
-        found = [d for d in found if d.joint not in taken and not lasts(d)][:CURVES]
-        there = lambda c: self.world.localised(c, when) if when else c
-        return [(there(d.candidate), d.values) for d in found]
+        found = [d for d in found if d.joint not in taken and not lasts(d)]
+        return [(d.candidate, d.values) for d in found[:CURVES]]
 
     def _finalists(self, beam, start, nodes):
         """Two lists of Nodes for the simulator, best first. Sets of other effects, not a better one

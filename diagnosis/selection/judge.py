@@ -122,7 +122,10 @@ class Judge:
 
 
 def nominal(option):
-    """Amounts (p,) of an option without its effect; infinite of a limit that there was not."""
+    """Amounts (p,) of an option without its effect; infinite of a limit, as no slope tells where it
+    is not met."""
+    if option.candidate.effect.bounds:
+        return np.full(len(option.columns), np.inf)
     away = np.array(option.candidate.nominal) - option.base
     return np.array([away[row != 0][0] / row[row != 0][0] for row in option.directions])
 
@@ -143,7 +146,7 @@ def problem(columns, chosen, gone=()):
 
 def without(fitted, candidate):
     """A Fitted set when an effect of it becomes nominal and the others move, as far as its columns
-    tell. Of a limit that there was not they tell nothing, so it is as if none missed it."""
+    tell. Of a limit they tell nothing, so it is as if none missed it."""
     options = fitted.columns.options
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     gone = [k for k, o in enumerate(options) if o.candidate is candidate]

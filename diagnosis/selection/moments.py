@@ -16,6 +16,7 @@ from diagnosis.selection.beam import Beam
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import PRICE, Evidence, complexity
 from diagnosis.selection.judge import problem
+from diagnosis.selection.missing_force import dependences
 from diagnosis.selection.transients import STEADY
 
 CLEARLY = 2.0  # times what any name that lasts promises, that one at times must promise
@@ -56,6 +57,15 @@ def rows_of(when, recordings):
     own = lambda r: when["recording"] in (None, r.name)
     inside = lambda r: (when["time"][0] <= r.time) & (r.time <= when["time"][1])
     return np.concatenate([own(r) & inside(r) for r in recordings])
+
+
+def followed(world, trajectory, recordings, when=None):
+    """The Dependences of the force that is located while a condition holds, on curves that act
+    under it; without one, all of the time."""
+    if not when:
+        return dependences(world, trajectory, recordings)
+    found = dependences(world, trajectory, recordings, rows_of(when, recordings))
+    return [replace(d, candidate=world.localised(d.candidate, when)) for d in found]
 
 
 def placed(world, candidate, when):

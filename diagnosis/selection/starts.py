@@ -157,8 +157,8 @@ def _full(candidate, base, rows, prior):
     if together > 1:  # waves act in proportion, as far as is plausible
         high = prior.high[0] / rows[0, 0]
         low = -high
-    if not finite:
-        low, high = 1.0, 1.0  # a limit that there was not: no share of it means anything
+    if not finite or candidate.effect.bounds:
+        low, high = 1.0, 1.0  # of what it does, no share of the way to it tells anything
     bounds = np.full(together, low), np.full(together, high)
     return Start(candidate, start, rows - start, *bounds, prior, together > 1)
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from diagnosis.trials.hiding import Item
+from diagnosis.trials.mjcf import to_mjcf
 from diagnosis.trials.prediction import model_residuals
-from diagnosis.trials.robots import to_mjcf
 
 REACH = 2.0  # a fitted value stays within this factor of the one it replaces
 

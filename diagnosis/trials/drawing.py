@@ -14,11 +14,13 @@ import numpy as np
 from diagnosis.trials import groups, hiding
 from diagnosis.trials.disguise import disguise
 from diagnosis.trials.experiment import Plan, channel_noise, record
+from diagnosis.trials.gates import gate, gate_name
 from diagnosis.trials.hiding import Usage
-from diagnosis.trials.laws import Gate, Law, Payload, Transmission
+from diagnosis.trials.laws import Gate
+from diagnosis.trials.mjcf import to_mjcf
 from diagnosis.trials.oracle import visibility
 from diagnosis.trials.prediction import model_error, system_error
-from diagnosis.trials.robots import TOUCHES, Robot, draw_robot, loguniform, to_mjcf
+from diagnosis.trials.robots import TOUCHES, Robot, draw_robot, loguniform
 from diagnosis.trials.truth import TrueSystem
 
 KINDS = ("null", "single", "unknown", "pair", "many")
@@ -138,13 +140,13 @@ def _hide_all(rng, kind, settings, robot, plan, usage, chosen, target):
         setters.append(_setter(effect, spot, item.parameters))
         owners += [len(items)] * len(more)
         alone = kind in ("single", "unknown")
-        more = _gate(rng, more, plan, settings, usage) if alone else more
+        more = gate(rng, more, plan, settings, usage) if alone else more
         if any(isinstance(law, Gate) and law.within for law in more):
             position = f"position:{robot.links[spot.link].joint_name}"
             item = replace(item, needs=tuple(dict.fromkeys((*item.needs, position))))
         laws += more
         items.append(item)
-    answer = {"gate": _gate_name(laws), "plan": asdict(plan)}
+    answer = {"gate": gate_name(laws), "plan": asdict(plan)}
     return Trial(answer, nominal, true, laws, items, owners, setters, [], [], noise)
 
 
@@ -330,44 +332,6 @@ def _setter(effect, spot, values):
     if effect not in groups.FIELDS and effect != groups.WRONG_AXIS:
         return lambda robot: robot
     return lambda robot: hiding.set_field(effect, spot, robot, values)
-
-
-def _gate(rng, laws, plan, settings, usage):
-    """In some trials a law acts from some moment on, in one recording, or in part of the travel."""
-    fate = rng.random()
-    train, runs = settings.train_runs, settings.train_runs + settings.held_out_runs
-    start = float(rng.uniform(0.3, 0.6) * plan.seconds)
-    some = (int(rng.integers(train)), *range(train, runs))
-    if laws and isinstance(laws[0], Payload):  # one that never changes is a mass
-        laws[0].__dict__.update({"start": start} if fate < 0.5 else {"runs": some})
-        return laws
-    gates = ({"start": start}, {"runs": some})
-    if fate > 0.24 or not all(_gateable(law) for law in laws):
-        return laws
-    if fate < 0.16:
-        return [Gate(law, **gates[fate < 0.08]) for law in laws]
-    quantiles = [usage.quantiles[law.link] for law in laws]
-    if any(law.effect for law in laws):  # no name says where in the travel it acts
-        return laws
-    return [Gate(law, within=(float(q[25]), float(q[65]))) for law, q in zip(laws, quantiles)]
-
-
-def _gateable(law):
-    """May a law come and go? Not what delays, measures, couples, or carries a rotor."""
-    base = Law
-    fixed = ("control", "measure", "couple")
-    same = all(getattr(type(law), name) is getattr(base, name) for name in fixed)
-    return same and not isinstance(law, Transmission)
-
-
-def _gate_name(laws):
-    """Which of the three, as a column says it; None where nothing comes and goes."""
-    for law in laws:
-        if isinstance(law, (Gate, Payload)):
-            if getattr(law, "within", None):
-                return "part of the travel"
-            return "one recording" if law.runs else "from a moment on"
-    return None
 
 
 def told_item(item, nominal, true):

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.common.atomic_files import write_together
-from diagnosis.trials.robots import to_mjcf
+from diagnosis.trials.mjcf import to_mjcf
 
 
 def write_folder(trial, folder):

@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from diagnosis.trials.mjcf import to_mjcf
 from diagnosis.trials.prediction import model_residuals, system_residuals, windows
-from diagnosis.trials.robots import to_mjcf
 from diagnosis.trials.truth import TrueSystem
 
 ENOUGH = 45.0  # noncentral chi² of 3 degrees passes the 1e-4 quantile in 99 % of draws

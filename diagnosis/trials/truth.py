@@ -19,7 +19,7 @@ import numpy as np
 
 from diagnosis.trials import laws as law_module
 from diagnosis.trials.laws import Air, Transmission
-from diagnosis.trials.robots import to_mjcf
+from diagnosis.trials.mjcf import to_mjcf
 
 
 class TrueSystem:

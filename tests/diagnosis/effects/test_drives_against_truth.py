@@ -15,7 +15,8 @@ from plants import commanded
 from diagnosis.effects.base import joints_of
 from diagnosis.simulation.simulator import Window, World
 from diagnosis.trials import laws as L
-from diagnosis.trials.robots import Actuator, Link, Robot, to_mjcf
+from diagnosis.trials.mjcf import to_mjcf
+from diagnosis.trials.robots import Actuator, Link, Robot
 from diagnosis.trials.truth import TrueSystem
 
 ROWS, DT = 60, 0.01

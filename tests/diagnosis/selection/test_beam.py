@@ -20,7 +20,7 @@ class Named:
         self.name, self.parameters, self.nominal = name, (None,), (0.0,)
         possible = lambda values, nominal: True
         self.when, self.lasting = None, self
-        self.effect = SimpleNamespace(name=name, simplicity=0, possible=possible)
+        self.effect = SimpleNamespace(name=name, simplicity=0, possible=possible, bounds=False)
 
 
 def test_two_that_explain_all_are_met_beside_many_that_each_lower_squares_more():
@@ -131,7 +131,7 @@ def test_what_made_up_for_an_effect_goes_when_that_joins(limit):
     named = {"mimic": mimic, "true": true}
     beam, names = made(named, true - mimic + 0.01 * rest, ahead, inside=["mimic"])
     if limit:
-        beam.columns.options[0].candidate.nominal = (np.inf,)
+        beam.columns.options[0].candidate.effect.bounds = True
         beam = Beam(beam.columns, beam.evidence)
     start, nodes = beam.nodes()
     assert names(start) == {"mimic"}

@@ -12,8 +12,7 @@ from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.selection import rivals
 from diagnosis.selection.criterion import Score, paired
-from diagnosis.selection.judge import Judge
-from diagnosis.selection.missing_force import MissingForce
+from diagnosis.selection.judge import Judge, without
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.simulator import World
 
@@ -42,9 +41,10 @@ def run(seed, damping=0.05, friction=0.0, gear=1.0, rows=800, noise=3e-4, stops=
     return Recording(f"{seed}.csv", time, noisy, np.full(qpos.shape, np.nan), ctrl)
 
 
-def judge_of(**hidden):
-    """Judge on two runs of a pendulum whose model lacks what is hidden."""
-    world = World(mujoco.MjSpec.from_string(PENDULUM.format(damping=0.05, friction=0, gear=1)))
+def judge_of(limits="", **hidden):
+    """Judge on two runs of a pendulum whose model lacks what is hidden; limits: of its drive."""
+    xml = PENDULUM.format(damping=0.05, friction=0, gear=1).replace("<motor", f"<motor {limits}")
+    world = World(mujoco.MjSpec.from_string(xml))
     runs = [run(k, **hidden) for k in range(2)]
     smoother = Smoother(world, runs)
     trajectory = smoother.locate({}, passes=2)
@@ -86,6 +86,19 @@ def test_a_stop_that_had_one_side_may_have_another_one_later():
     assert again == pytest.approx(anew, abs=1e-4) and anew == pytest.approx((low, high), abs=0.01)
 
 
+def test_small_changes_do_not_tell_what_a_limit_is_without():
+    """Its slope at 0.2 N·m says nothing of 13 N·m, which is never met."""
+    judge = judge_of(limits='forcerange="-13 13"')
+    world = judge.ahead.world
+    limit, friction = (
+        world.candidate("saturation", "drive"),
+        world.candidate("coulomb_friction", "pivot"),
+    )
+    fitted = judge.fit({limit: (0.2,), friction: (0.05,)}, steps=0)
+    assert without(fitted, limit).loss == -np.inf
+    assert np.isfinite(without(fitted, friction).loss)
+
+
 def test_values_stay_inside_what_is_plausible():
     judge = judge_of(friction=0.06)
     gain = judge.ahead.world.candidate("gain", "drive")
@@ -112,10 +125,10 @@ def test_back_emf_and_viscous_damping_are_one_class():
     )
     names = "viscous_damping", "back_emf", "coulomb_friction", "gain", "stiffness"
     pool = [c for c in world.candidates if c.effect.name in names]
-    missing = MissingForce(along(judge), {})
+    chain = along(judge)
     for found in (damping, back_emf):
         fitted = judge.fit({found: (0.1,)})
-        again, others = rivals.classes(pool, judge, missing, fitted, lambda setting: judge)
+        again, others = rivals.classes(pool, judge, chain, fitted, lambda setting: judge)
         [named] = again.setting
         told = {named, *(c for c, _ in others[named])}
         assert {damping, back_emf} <= told
@@ -132,8 +145,8 @@ def test_what_is_no_equal_is_not_told():
     fitted = judge.fit({friction: (0.05,)})
     others = "gain", "stiffness", "mass", "delay", "viscous_damping", "gravity", "bias"
     pool = [c for c in world.candidates if c.effect.name in others]
-    missing = MissingForce(along(judge), {})
-    again, told = rivals.classes(pool, judge, missing, fitted, lambda setting: judge)
+    chain = along(judge)
+    again, told = rivals.classes(pool, judge, chain, fitted, lambda setting: judge)
     assert list(again.setting) == [friction]
     assert told[friction] == []
 

@@ -191,3 +191,17 @@ def test_all_that_is_begun_of_a_shape_is_plausible(effect):
     starts = Starts(world, {}, usual).of([candidate])
     assert sum(len(s.directions) for s in starts) == len(probes)
     assert all(prior.inside(s.base + row) for s in starts for row in s.directions)
+
+
+def test_a_limit_that_is_not_met_is_begun_at_whole_values_as_one_that_there_was_not(machine):
+    """On the way from 13 N·m to what the drive asks for nothing changes: no share of it tells."""
+    world, usual = machine
+    limited = DRIVEN_PENDULUM.replace('joint="pivot"/>', 'joint="pivot" forcerange="-13 13"/>')
+    other = World(mujoco.MjSpec.from_string(limited.format(damping=0.05, mass=0.5)))
+    begun = []
+    for each in (world, other):
+        own = Usual(each, usual.recordings, np.ones(1))
+        starts = Starts(each, {}, own).of([each.candidate("saturation", "drive")])
+        assert starts and all((s.low == 1).all() and (s.high == 1).all() for s in starts)
+        begun.append({round(float((s.base + s.directions)[0, 0]), 9) for s in starts})
+    assert begun[0] and begun[0] <= begun[1]

@@ -10,7 +10,8 @@ from diagnosis.simulation.simulator import Window, World
 from diagnosis.trials.drawing import Unfit, choose, told_item
 from diagnosis.trials.groups import FIELDS, LAWS, MIMICS, ONE_LAW, WRONG_AXIS
 from diagnosis.trials.hiding import Usage, hide, places
-from diagnosis.trials.robots import FINAL, draw_robot, to_mjcf
+from diagnosis.trials.mjcf import to_mjcf
+from diagnosis.trials.robots import FINAL, draw_robot
 from diagnosis.trials.truth import TrueSystem
 
 ROW, ROWS = 0.005, 40

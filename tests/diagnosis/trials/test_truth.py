@@ -10,8 +10,9 @@ from scipy.integrate import solve_ivp
 
 from diagnosis.trials import laws as L
 from diagnosis.trials.experiment import Plan, record
+from diagnosis.trials.mjcf import to_mjcf
 from diagnosis.trials.prediction import model_error, system_error, windows
-from diagnosis.trials.robots import DEVELOPMENT, FINAL, Actuator, Link, Robot, draw_robot, to_mjcf
+from diagnosis.trials.robots import DEVELOPMENT, FINAL, Actuator, Link, Robot, draw_robot
 from diagnosis.trials.truth import TrueSystem, dry_friction
 
 MASS, LEVER, ABOUT = 0.8, 0.3, 0.02  # kg, m, kg·m²
