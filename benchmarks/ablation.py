@@ -47,6 +47,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "a member of a class is no worse, even by chance": {"diagnosis.selection.rivals:CHANCE": 1.0},
     "differences must be alike": {"diagnosis.selection.criterion:INDEPENDENT": 0.0},
     "no first look": {"diagnosis.selection.beam:EACH": 10**6},
+    "rows in which a joint sticks count": {"diagnosis.selection.missing_force:STICKS": 0.0},
     "five further effects in each first look": {"diagnosis.selection.beam:EACH": 5},
     "rounds until nothing is new": {"diagnosis.selection.identification:LEFT": 2.0},
     "all whole values are moved": {"diagnosis.selection.columns:MOVED": 10**6},

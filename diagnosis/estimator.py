@@ -222,7 +222,7 @@ def _beside(search, judge, fitted, rest, price):
 def _classes(search, found, fitted, log, candidates, asked=None):
     """(Fitted, {candidate: [(other, values)]}): the classes of its findings among candidates."""
     begun = lambda setting: search.begun(found.judge, setting)
-    return rivals.classes(candidates, found.judge, found.chain, fitted, begun, asked, log)
+    return rivals.classes(candidates, found.judge, found.missing, fitted, begun, asked, log)
 
 
 def _at(world, candidate, joint):

@@ -1,6 +1,6 @@
 """A beam over sets of effects on one matrix of sums: the sets worth a refit in the simulator.
 
-starts = likely(chain, setting, starts)     # in a first look, those worth a column in every window
+starts = likely(missing, starts)        # in a first look, those worth a column in every window
 start, nodes = Beam(columns, evidence).nodes()
 """
 
@@ -16,7 +16,7 @@ from diagnosis.selection.plausibility import cost
 WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in each in full
 DEPTH = 4  # effects added in one round
 LEAST = 0.01  # loss that an effect must remove in the search
-GLANCES = 8, 0.3  # beginnings of windows that are looked at first, and their length, s
+GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
 MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; new ones in each
 
 
@@ -165,18 +165,26 @@ class Beam:
         return {c: v for c, v in moved.items() if c in inside}
 
 
-def likely(chain, setting, starts):
-    """Of Starts, the best ones of those candidates that gain most beside a setting, alone or beside
-    the best, in the beginnings of some of a Chain's windows. Kept are the effects of the setting as
-    well, and waves, which the located force has chosen."""
+def likely(missing, starts):
+    """Of Starts, the best ones of those candidates that explain most alone, or beside the best, a
+    row ahead, or in short windows where no row tells or the motion mostly touches something. Kept
+    are the effects of the setting as well, and waves, which the located force has chosen."""
+    chain, setting = missing.chain, missing.setting
     chosen = lambda start: start.candidate in setting or start.merges
     kept = [start for start in starts if chosen(start)]
     new = [start for start in starts if not chosen(start)]
-    if not new:
-        return kept
+    in_rows, in_windows, some = [], [], []
     rounds = len(chain.channels) + MORE
-    some = _by_windows(chain.beginnings(*GLANCES), setting, kept, new, rounds)
-    return [*dict.fromkeys([*kept, *some])]  # a wave may be among the best as well
+    for start in new:
+        (in_windows if chain.touches or chain.apart(start.candidate) else in_rows).append(start)
+    if in_rows:
+        bases = {start: missing.basis(start) for start in in_rows}
+        in_windows += [start for start in in_rows if bases[start] is None]
+        bases = {start: basis for start, basis in bases.items() if basis is not None}
+        some = _by_rows(missing.force, bases, rounds)
+    if in_windows:
+        some += _by_windows(chain.beginnings(*GLANCES), setting, kept, in_windows, rounds)
+    return [*dict.fromkeys([*kept, *some])]  # a wave may be among the best in windows as well
 
 
 def _best(gains, kept):
@@ -188,6 +196,20 @@ def _best(gains, kept):
         if start.candidate not in known:
             best.setdefault(start.candidate, {}).setdefault(start.whole, start)
     return order[0], [start for each in list(best.values())[:EACH] for start in each.values()]
+
+
+def _by_rows(target, bases, rounds):
+    """The Starts whose bases (n, dofs, p) explain most of a target (n, dofs)."""
+    kept, target = {}, target.ravel()
+    bases = {start: basis.reshape(len(target), -1) for start, basis in bases.items()}
+    for _ in range(rounds if bases else 0):
+        gains = {start: explained(basis, target) for start, basis in bases.items()}
+        best, further = _best(gains, kept)
+        kept |= dict.fromkeys(further)
+        beside = np.linalg.qr(bases[best])[0]
+        rest = lambda x: x - beside @ (beside.T @ x)
+        target, bases = rest(target), {start: rest(basis) for start, basis in bases.items()}
+    return list(kept)
 
 
 def _by_windows(short, setting, inside, starts, rounds):
@@ -228,3 +250,9 @@ def _renew(gains, kept, look):
             break
         gains |= look(some)
         known |= {*some}
+
+
+def explained(basis, target):
+    """Share of the squares of a target (n,) that columns (n, k) explain."""
+    left = target - basis @ np.linalg.lstsq(basis, target, rcond=None)[0]
+    return 1 - left @ left / (target @ target + 1e-300)

@@ -20,6 +20,7 @@ from diagnosis.selection.beam import LEAST, Beam, likely
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.judge import Fitted, Judge, perfect, without
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual
 from diagnosis.selection.rivals import TIED, as_good, carried
 from diagnosis.selection.starts import Starts
@@ -36,8 +37,8 @@ TRIED = 2  # effects of a set that may be missed least, tried without
 @dataclass(frozen=True)
 class Found:
     """What the search ended with: fitted, the Fitted set; trajectory and first, smoothed under it
-    and under the nominal model; judge, on the windows begun at that trajectory; chain, along it;
-    ranking: [(candidate, loss removed alone, p-value)], most
+    and under the nominal model; judge, on the windows begun at that trajectory; missing, the
+    MissingForce of the last round; ranking: [(candidate, loss removed alone, p-value)], most
     first; sets: Fitted sets of other effects that predict as well."""
 
     fitted: Fitted
@@ -46,7 +47,7 @@ class Found:
     smoother: Smoother
     usual: Usual
     judge: Judge
-    chain: Chain
+    missing: MissingForce
     ranking: list
     sets: list
 
@@ -57,7 +58,7 @@ class Identification:
     def __init__(self, world, train, say=None, log=None):
         self.world, self.train = world, train
         self.say, self.log = say or (lambda done, what: None), log or (lambda what: None)
-        self.seen, self.sets, self.ranking = {}, [], []
+        self.seen, self.missing, self.sets, self.ranking = {}, None, [], []
         self.looked = 1.0  # how many different columns a round looks at
         apart = lambda c: c.place.kind == "sensor" or c.effect.timed or c.effect.numerical
         self.candidates = [c for c in world.candidates if not apart(c)]
@@ -70,6 +71,7 @@ class Identification:
             judge = self.begin(setting, trajectory)
             now = judge.fit(setting)
             if i == ROUNDS or (i and not self.something(now)):
+                self.missing = MissingForce(self.screen, setting, self.missing)
                 fitted, self.sets = now, carried(judge, self.sets, now, now)
                 break
             self.say(0.1 + 0.15 * i, f"searching {len(self.candidates)} candidates")
@@ -79,7 +81,7 @@ class Identification:
             setting = fitted.setting
             trajectory = self.smoother.locate(setting, trajectory)
         known = trajectory, first, self.smoother, self.usual, judge
-        return Found(fitted, *known, self.screen, self.ranking, self.sets)
+        return Found(fitted, *known, self.missing, self.ranking, self.sets)
 
     def again(self, setting, trajectory):
         """The Fitted set of one more round, without curves, from a setting and a trajectory of one
@@ -133,8 +135,9 @@ class Identification:
         others = [c for c in self.candidates if c not in inside]
         known = self.usual, self.seen, self.trajectory, self.screen.touches
         starts = Starts(self.world, setting, *known)
+        self.missing = missing = MissingForce(self.screen, setting, self.missing)
         tried = starts.of([*setting, *others])
-        some = likely(self.screen, setting, tried)
+        some = likely(missing, tried)
         some += [starts.curve(*curve) for curve in curves]
         columns = Columns(self.screen, setting, some, seen=self.seen)
         nominal = squares(self.screen, columns.residual if not setting else None)

@@ -1,6 +1,8 @@
-"""What the force depends on that the simulator lacks along the measured motion, where no name holds
-it.
+"""The force that the simulator lacks along the measured motion, what of it effects hold, and what
+it depends on where no name holds it.
 
+missing = MissingForce(chain, setting)
+missing.basis(start)                    # (rows, dofs, p): what a Start holds of it
 for found in dependences(world, trajectory, recordings): found.joint, found.candidate
 """
 
@@ -13,6 +15,10 @@ from diagnosis.effects.drives import drives_of
 from diagnosis.effects.unmodelled import asked, reader
 from diagnosis.estimation import windowing
 
+ROWS = 300  # in which forces are looked at, at most
+STICKS = 0.1  # of the usual effect of a force on a joint, below which it sticks in a row
+ODD = 5.0  # of its usual size, beyond which what is missing in a row counts no more
+SMALLEST = 0.05  # of its RMS, that its usual size is taken to be
 FINE, KNOTS = 33, 9  # places over the range where a curve may bend, and values that it has at most
 BLOCKS = 16  # stretches of time that are left out in turn
 # share of the located force's variance, predicted on stretches left out, that a curve must explain
@@ -23,6 +29,61 @@ WAVES = 1.0, 30.0, 0.1
 SLOWEST = 2.0
 SAMPLED = 2000  # rows in which these are looked for
 CLIP = 5.0  # of the usual size, beyond which a located force counts no more
+
+
+class MissingForce:
+    """In rows of a Chain where nothing touches, under a setting. force (n, nv), in units of what is
+    usual in each dof; rows (n,): those of the Chain that are looked at."""
+
+    def __init__(self, chain, setting, before=None):
+        """before: a MissingForce in the same rows, from which what effects do there that neither
+        setting has is taken over: a motion that is located anew hardly moves."""
+        self.chain, self.setting, self.plain = chain, setting, chain.plain(setting)
+        self.rows = chain.used[windowing.evenly(len(chain.used), ROWS)]
+        self.done, t = {}, chain.trajectory
+        if before and np.array_equal(before.rows, self.rows):
+            known, inside = before.done.items(), {*setting, *before.setting}
+            self.done = {key: done for key, done in known if key[0] not in inside}
+        if len(self.rows):
+            driven = t.driven[self.rows, chain.model.nv :]
+            moves = np.linalg.norm(driven, axis=1)
+            sticks = moves < STICKS * rms(moves)  # a joint that sticks obeys no force
+            self.obeyed = np.where(sticks[..., None], 0.0, np.linalg.pinv(driven))
+            self.whole = self._pushed(self.plain)
+            # it was located under the chain's own setting
+            force = t.force[self.rows] + self.whole - self._pushed(chain.base)
+            size = 1.4826 * np.median(abs(force), 0) + SMALLEST * rms(force) + 1e-12
+            seen = np.isfinite(chain.noise)
+            self.weight = np.where(seen, 1 / np.maximum(size, abs(force) / ODD), 0.0)
+            self.force = force * self.weight
+
+    def _pushed(self, plain):
+        """Generalized force (n, nv) that a plain setting lacks in each row, as it is."""
+        lacks = self.chain.missing(plain, self.rows)[:, self.chain.model.nv :]
+        return (self.obeyed @ lacks[..., None])[..., 0]
+
+    def basis(self, start):
+        """(n, nv, p): what a Start holds of the force, each row as it is; None where no row
+        tells. What acts at a joint or a drive is no force elsewhere: what a row with several
+        steps leaves there is small, but so may be what is usual there."""
+        if self.chain.apart(start.candidate) or not len(self.rows):
+            return None
+        every = start.settings(self.plain)
+        keys = [(start.candidate, setting[start.candidate]) for setting in every]
+        for key, setting in zip(keys, every):  # what it does is worked out once for its values
+            if key not in self.done:
+                self.done[key] = self.whole - self._pushed(setting)
+        every = [self.done[key] for key in keys]
+        moved = any(done.any() for done in every) and np.isfinite(every).all()
+        weight = (self.weight * self._own(start.candidate.place))[..., None]
+        return np.stack(every, -1) * weight if moved else None
+
+    def _own(self, place):
+        """(nv,): in which dofs what acts at a place may be a force."""
+        model, joints = self.chain.model, self.chain.world.joints(place)
+        if place.kind not in ("joint", "actuator") or joints is None:
+            return np.ones(model.nv, bool)
+        return np.isin(model.dof_jntid, list(joints))
 
 
 def rms(x):

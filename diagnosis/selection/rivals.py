@@ -1,7 +1,7 @@
 """What could stand in a finding's place: effects whose refits predict as well, told as a class, the
 best for its price first.
 
-fitted, others = classes(candidates, judge, chain, fitted, begun)
+fitted, others = classes(candidates, judge, missing, fitted, begun)
 others[candidate]                                    # [(other, values), ...]
 
 earlier = carried(judge, sets, now, best)            # sets of the round before, judged in this one
@@ -17,6 +17,7 @@ from diagnosis.selection.beam import likely
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence, complexity, paired
 from diagnosis.selection.judge import problem
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.starts import Starts
 
 APART = 0.3  # share of an effect that another may leave in its place, as far as columns tell
@@ -28,10 +29,10 @@ REFITS, MOST = 4, 3  # others that are refitted, and told
 SETS = 3  # of other effects, that are carried from round to round
 
 
-def classes(candidates, judge, chain, fitted, begun, asked=None, log=lambda what: None):
+def classes(candidates, judge, missing, fitted, begun, asked=None, log=lambda what: None):
     """(Fitted, {candidate: [(other, values)]}): each finding by the best member of its class, for
-    its price, and the other members. Among equals the finding stays. chain: along the motion;
-    begun(setting): a Judge whose windows begin at the motion that is located under a
+    its price, and the other members. Among equals the finding stays. missing: a MissingForce along
+    the motion; begun(setting): a Judge whose windows begin at the motion that is located under a
     setting; asked: the findings whose class is asked, all by default. A finer time step is no
     physics, so nothing is asked for in its place."""
     others, swapped, held = {}, False, None
@@ -39,8 +40,8 @@ def classes(candidates, judge, chain, fitted, begun, asked=None, log=lambda what
         if candidate not in fitted.setting or candidate.effect.numerical:
             continue
         if held is None or held.setting != fitted.setting:
-            held = _along(chain, judge, fitted.setting)
-        members = _members(candidates, judge, chain, fitted, candidate, held)
+            held = _along(missing.chain, judge, fitted.setting)
+        members = _members(candidates, judge, missing, fitted, candidate, held)
         units, most = complexity(fitted.setting), fitted.loss - TIED
         better = [m for m in members if m[0].loss < most or complexity(m[0].setting) < units]
         members.append((fitted, candidate))
@@ -52,7 +53,7 @@ def classes(candidates, judge, chain, fitted, begun, asked=None, log=lambda what
         others[own] = [(o, f.setting[o]) for f, o in tied if o is not own]
         told = {o for o, _ in others[own]}
         pool = [c for c in candidates if c not in told and c not in fitted.setting]
-        others[own] += _late(pool, begun, chain.world, fitted, own)
+        others[own] += _late(pool, begun, missing.chain.world, fitted, own)
     others = {c: each[:MOST] for c, each in others.items() if c in fitted.setting}
     return (judge.fit(fitted.setting, steps=2) if swapped else fitted), others
 
@@ -106,20 +107,21 @@ def _along(chain, judge, setting):
     return Columns(chain, setting, starts.of(setting))
 
 
-def _members(candidates, judge, chain, fitted, candidate, held):
+def _members(candidates, judge, before, fitted, candidate, held):
     """[(Fitted, other)] of the effects that predict as well in a finding's place, or are better for
     their price, best first. held: Columns of the Fitted set."""
     rest = {c: v for c, v in fitted.setting.items() if c is not candidate}
     pool = [c for c in candidates if c not in fitted.setting]
-    world, model, out = chain.world, chain.world.model, []
+    missing, out = MissingForce(before.chain, rest, before), []
+    world, model = before.chain.world, before.chain.world.model
     if candidate.when:
-        some = [c for c in world.candidates if not chain.apart(c) and c != candidate.lasting]
+        some = [c for c in world.candidates if not before.chain.apart(c) and c != candidate.lasting]
         pool += filter(None, (moments.placed(world, c, candidate.when) for c in some))
     # two geoms of one contact share its numbers, and columns tell little of them
     twin = candidate.effect.twin(model, candidate.effect.id(model, candidate.place.name))
     twins = [c for c in pool if (c.effect, c.place.name) == (candidate.effect, twin)]
     near = [(c, fitted.setting[candidate]) for c in twins]
-    alike = _alike(judge, chain, rest, candidate, pool, held)
+    alike = _alike(judge, missing, candidate, pool, held)
     near += [(other, values) for other, values in alike if other not in twins]
     for other, values in near[:REFITS]:
         tried = judge.fit({**rest, other: values}, near=fitted)
@@ -152,16 +154,16 @@ def _tied(tried, fitted):
     return worse.gain < TIED or worse.p_value > CHANCE
 
 
-def _alike(judge, chain, rest, candidate, pool, held):
+def _alike(judge, missing, candidate, pool, held):
     """[(other, values)] of a pool that act where the candidate does, or everywhere, and predict
     about as well in its place as far as columns at the model without it tell, the best first, and
     of those that are as good the simplest. held: Columns of the set, which stand for those without
     the candidate."""
-    units = complexity([candidate]) + FURTHER
+    chain, rest, units = missing.chain, missing.setting, complexity([candidate]) + FURTHER
     near = [c for c in pool if complexity([c]) <= units and meet(chain.world, c, candidate)]
     starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory)
     starts = starts.of([*near, *rest])
-    columns = Columns(chain, rest, likely(chain, rest, starts), known=held)
+    columns = Columns(chain, rest, likely(missing, starts), known=held)
     options, evidence = columns.options, columns.evidence(judge.reference)
     kept = [k for k, o in enumerate(options) if o.candidate in rest]
     gap = held.residual + APART * (columns.residual - held.residual)

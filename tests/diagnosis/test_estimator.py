@@ -196,8 +196,7 @@ def test_recordings_without_positions_are_refused():
 @pytest.mark.parametrize("better", [False, True])
 def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, better):
     monkeypatch.setattr(estimator, "lacking", lambda fitted: fitted.setting)
-    told = lambda world, trajectory, train: trajectory
-    monkeypatch.setattr(estimator.missing_force, "dependences", told)
+    monkeypatch.setattr(estimator, "_left", lambda search, fitted, trajectory: trajectory)
     locate = lambda setting, near: f"{near} in {setting}"
     found = SimpleNamespace(judge=None, smoother=SimpleNamespace(locate=locate))
     fitted = SimpleNamespace(setting="usual steps")

@@ -14,6 +14,7 @@ from diagnosis.recordings.recording import Recording
 from diagnosis.selection import beam
 from diagnosis.selection.beam import likely
 from diagnosis.selection.columns import Columns
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.selection.starts import Start, Starts
 from diagnosis.simulation.simulator import World
@@ -46,7 +47,8 @@ def starts(scene, *names):
 
 
 def kept_of(scene, some, setting={}):
-    return {start.candidate.effect.name for start in likely(scene[1], setting, some)}
+    missing = MissingForce(scene[1], setting)
+    return {start.candidate.effect.name for start in likely(missing, some)}
 
 
 def test_what_is_missing_is_kept_first(scene, monkeypatch):
@@ -83,11 +85,36 @@ def test_what_shows_only_beside_the_best_is_kept(monkeypatch):
     assert {"coulomb_friction", "viscous_damping"} <= kept_of(other, some)
 
 
+def test_what_no_row_tells_is_asked_in_windows(scene, monkeypatch):
+    """A sensor's scale, and everything where the motion mostly touches something."""
+    world, chain, _ = scene
+    monkeypatch.setattr(beam, "EACH", 1)
+    monkeypatch.setattr(beam, "MORE", 0)
+    each = starts(scene, "sensor_scale", "sensor_bias", "coulomb_friction", "mass", "armature")
+    rows = {"coulomb_friction"}
+    kept = kept_of(scene, each)
+    assert rows < kept and kept - rows <= {"sensor_scale", "sensor_bias"}
+    touching = Chain(world, chain.windows, chain.noise)
+    free = np.ones(len(chain.trajectory.free), bool)
+    touching.start(replace(chain.trajectory, free=free))
+    assert kept_of((world, touching, None), each) == {"coulomb_friction"}
+
+
+def test_what_changes_nothing_in_the_rows_is_asked_in_windows(scene, monkeypatch):
+    _, chain, _ = scene
+    some = starts(scene, "coulomb_friction", "mass")
+    monkeypatch.setattr(chain, "missing", lambda setting, rows: np.ones((len(rows), 2)))
+    asked = lambda short, setting, kept, asked, rounds: asked
+    monkeypatch.setattr(beam, "_by_windows", asked)
+    assert likely(MissingForce(chain, {}), some) == some
+
+
 def test_of_a_candidate_the_best_share_and_the_best_whole_value_are_kept(scene):
     friction = starts(scene, "coulomb_friction")[0]
     size = lambda x: replace(friction, directions=np.array([[x]]), low=np.array([0.3]))
     tried = [friction, replace(friction, directions=np.array([[-0.9]])), size(0.1), size(3.0)]
-    kept = beam._by_windows(scene[1], {}, [], tried, 1)
+    missing = MissingForce(scene[1], {})
+    kept = beam._by_rows(missing.force, {s: missing.basis(s) for s in tried}, 1)
     assert len(kept) == 2 and kept.count(tried[2]) == 1
     assert [start.whole for start in sorted(kept, key=lambda s: s.whole)] == [False, True]
 
@@ -108,7 +135,7 @@ def test_whole_values_are_looked_at_within_their_bounds(monkeypatch):
     whole = lambda x: Start(candidate, np.zeros(1), np.array([[x]]), *bounds, prior)
     near, tiny = whole(0.8 * seconds), whole(seconds / 30)
     monkeypatch.setattr(beam, "MORE", 0)
-    assert likely(chain, {}, [tiny, near]) == [near]
+    assert likely(MissingForce(chain, {}), [tiny, near]) == [near]
 
 
 def test_a_look_at_all_starts_keeps_those_of_the_setting(scene, monkeypatch):
@@ -118,7 +145,7 @@ def test_a_look_at_all_starts_keeps_those_of_the_setting(scene, monkeypatch):
     friction = world.candidate("coulomb_friction", "pivot")
     setting = {armature: armature.nominal}
     every = Starts(world, setting, usual).of([armature, friction, world.candidate("mass", "arm")])
-    kept = {start.candidate for start in likely(chain, setting, every)}
+    kept = {start.candidate for start in likely(MissingForce(chain, setting), every)}
     assert {armature, friction} <= kept
 
 
@@ -185,7 +212,7 @@ def test_a_tone_between_two_that_are_tried_is_moved_to():
     chain.start(smoother.locate({}))
     usual = Usual(world, runs, smoother.scale)
     every = Starts(world, {}, usual).of([world.candidate("joint_elasticity", "shaft")])
-    columns = Columns(chain, {}, likely(chain, {}, every))
+    columns = Columns(chain, {}, likely(MissingForce(chain, {}), every))
     off = lambda: min(abs((o.base + o.directions[0])[0] / stiffness - 1) for o in columns.options)
     assert off() > 0.2
     columns.nearer(None, every)

@@ -294,7 +294,6 @@ def rounds(search, monkeypatch, something):
     monkeypatch.setattr(search, "locate", lambda setting: ("located", "first"))
     monkeypatch.setattr(search, "something", something)
     search.smoother, search.usual = SimpleNamespace(locate=lambda *given, **how: "moved"), None
-    search.screen = "chain"
 
     def round_of(judge, now, curves):
         asked.append((now, curves))
@@ -316,10 +315,12 @@ def test_rounds_go_on_while_they_end_with_other_sets(search, monkeypatch):
 
 def test_no_round_follows_a_set_beside_which_a_perfect_simulator_is_no_better(search, monkeypatch):
     nothing, best, asked = rounds(search, monkeypatch, lambda now: now is nothing)
+    monkeypatch.setattr(identification, "MissingForce", lambda *given: "missing")
     monkeypatch.setattr(identification, "carried", lambda judge, sets, now, best: ["sets"])
+    search.screen = None
     found = search.run()
     assert asked == [(nothing, "curves")] and found.fitted is best
-    assert (found.chain, found.sets) == ("chain", ["sets"])
+    assert (found.missing, found.sets) == ("missing", ["sets"])
 
 
 def test_what_finer_steps_explain_as_well_is_no_physics(search, monkeypatch):

@@ -13,6 +13,7 @@ from diagnosis.recordings.recording import Recording
 from diagnosis.selection import rivals
 from diagnosis.selection.criterion import Score, paired
 from diagnosis.selection.judge import Judge, without
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.simulator import World
 
@@ -89,11 +90,8 @@ def test_a_stop_that_had_one_side_may_have_another_one_later():
 def test_small_changes_do_not_tell_what_a_limit_is_without():
     """Its slope at 0.2 N·m says nothing of 13 N·m, which is never met."""
     judge = judge_of(limits='forcerange="-13 13"')
-    world = judge.ahead.world
-    limit, friction = (
-        world.candidate("saturation", "drive"),
-        world.candidate("coulomb_friction", "pivot"),
-    )
+    of = judge.ahead.world.candidate
+    limit, friction = of("saturation", "drive"), of("coulomb_friction", "pivot")
     fitted = judge.fit({limit: (0.2,), friction: (0.05,)}, steps=0)
     assert without(fitted, limit).loss == -np.inf
     assert np.isfinite(without(fitted, friction).loss)
@@ -125,10 +123,10 @@ def test_back_emf_and_viscous_damping_are_one_class():
     )
     names = "viscous_damping", "back_emf", "coulomb_friction", "gain", "stiffness"
     pool = [c for c in world.candidates if c.effect.name in names]
-    chain = along(judge)
+    missing = MissingForce(along(judge), {})
     for found in (damping, back_emf):
         fitted = judge.fit({found: (0.1,)})
-        again, others = rivals.classes(pool, judge, chain, fitted, lambda setting: judge)
+        again, others = rivals.classes(pool, judge, missing, fitted, lambda setting: judge)
         [named] = again.setting
         told = {named, *(c for c, _ in others[named])}
         assert {damping, back_emf} <= told
@@ -145,8 +143,8 @@ def test_what_is_no_equal_is_not_told():
     fitted = judge.fit({friction: (0.05,)})
     others = "gain", "stiffness", "mass", "delay", "viscous_damping", "gravity", "bias"
     pool = [c for c in world.candidates if c.effect.name in others]
-    chain = along(judge)
-    again, told = rivals.classes(pool, judge, chain, fitted, lambda setting: judge)
+    missing = MissingForce(along(judge), {})
+    again, told = rivals.classes(pool, judge, missing, fitted, lambda setting: judge)
     assert list(again.setting) == [friction]
     assert told[friction] == []
 

@@ -11,6 +11,7 @@ from diagnosis.effects.unmodelled import Unknown
 from diagnosis.selection import rivals
 from diagnosis.selection.criterion import PRICE, Score
 from diagnosis.selection.identification import Identification
+from diagnosis.selection.missing_force import MissingForce
 from diagnosis.simulation.simulator import World
 
 
@@ -47,9 +48,10 @@ def chosen(monkeypatch, fitted, losses, asked=None):
     others = [(c, (1.0,)) for c in names.values() if c.name != fitted]
     monkeypatch.setattr(rivals, "_alike", lambda *args: others)
     world = SimpleNamespace(model=None)
-    silent = SimpleNamespace(world=world)
+    silent = SimpleNamespace(chain=SimpleNamespace(world=world))
     held = SimpleNamespace(setting=None)
     monkeypatch.setattr(rivals, "_along", lambda *args: held)
+    monkeypatch.setattr(rivals, "MissingForce", lambda *args: silent)
     monkeypatch.setattr(rivals, "_late", lambda *args: [])
     start = Judge().fit({names[fitted]: (2.0,)})
     found, told = rivals.classes([DRY, CURVED], Judge(), silent, start, None, asked)
@@ -101,9 +103,10 @@ def test_the_floor_is_tried_for_a_foot_at_the_findings_own_value_and_no_other_fo
         fit=lambda setting, **how: begun.append(setting) or SimpleNamespace(settled=False)
     )
     monkeypatch.setattr(rivals, "_alike", lambda *args: [(damping, (5.0,)), (floor, (0.9,))])
-    chain = SimpleNamespace(world=world)
+    monkeypatch.setattr(rivals, "MissingForce", lambda *args: None)
+    before = SimpleNamespace(chain=SimpleNamespace(world=world))
     fitted = SimpleNamespace(setting={foot: (0.2,)})
-    rivals._members(world.candidates, judge, chain, fitted, foot, None)
+    rivals._members(world.candidates, judge, before, fitted, foot, None)
     assert begun == [{floor: (0.2,)}, {damping: (5.0,)}]
 
 
@@ -180,9 +183,8 @@ def test_another_effect_is_begun_at_the_value_that_it_takes_not_near_its_starts(
     search = Identification(world, runs)
     judge = search.begin({}, search.locate({})[0])
     fitted = judge.fit({damping: (0.01 + more,)})
+    missing = MissingForce(search.screen, {})
     held = rivals._along(search.screen, judge, fitted.setting)
-    monkeypatch.setattr(
-        rivals, "likely", lambda chain, setting, starts: [s for s in starts if s.whole]
-    )
-    [(other, (value,))] = rivals._alike(judge, search.screen, {}, damping, [back_emf], held)
+    monkeypatch.setattr(rivals, "likely", lambda missing, starts: [s for s in starts if s.whole])
+    [(other, (value,))] = rivals._alike(judge, missing, damping, [back_emf], held)
     assert other is back_emf and value == pytest.approx(more, rel=0.1)
