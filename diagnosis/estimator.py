@@ -161,8 +161,8 @@ def _checked(search, found, fitted, others, log):
 
 
 def _left(search, fitted, trajectory):
-    """The Dependences of what a Fitted set leaves of the force, while that of it acts which comes
-    and goes."""
+    """The Dependences of what a Fitted set leaves of the force: beside effects that act at times,
+    those of the time in which they act."""
     when = condition_of(fitted.setting)
     return moments.followed(search.world, trajectory, search.train, when)
 

@@ -122,7 +122,7 @@ def beside(finding, names):
             "p_value": min(told, default=None),
         },
         "depends_on": list(dict.fromkeys(on))[:MOST],
-        "when": next((f["when"] for f in every if f.get("when")), None),
+        "when": next((f["when"] for f in every if f["when"]), None),
         "written_as": written[0] if written else "none",
         "also_possible": [*finding["also_possible"], *named, *members][:MOST],
     }

@@ -122,8 +122,8 @@ class Judge:
 
 
 def nominal(option):
-    """Amounts (p,) of an option without its effect; infinite of a limit, as no slope tells where it
-    is not met."""
+    """Amounts (p,) of an option without its effect; infinite of a limit: slopes where it is met say
+    nothing of where it is not."""
     if option.candidate.effect.bounds:
         return np.full(len(option.columns), np.inf)
     away = np.array(option.candidate.nominal) - option.base

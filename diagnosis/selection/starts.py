@@ -158,7 +158,7 @@ def _full(candidate, base, rows, prior):
         high = prior.high[0] / rows[0, 0]
         low = -high
     if not finite or candidate.effect.bounds:
-        low, high = 1.0, 1.0  # of what it does, no share of the way to it tells anything
+        low, high = 1.0, 1.0  # a limit: no share of the way to it means anything
     bounds = np.full(together, low), np.full(together, high)
     return Start(candidate, start, rows - start, *bounds, prior, together > 1)
 

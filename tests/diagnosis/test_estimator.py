@@ -193,10 +193,23 @@ def test_recordings_without_positions_are_refused():
         identify(world, [run], [])
 
 
+def test_what_is_left_is_looked_at_while_the_effects_of_a_set_act(monkeypatch):
+    monkeypatch.setattr(estimator.moments, "followed", lambda *given: given[-1])
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    search = SimpleNamespace(world=world, train=[])
+    when = {"recording": "1.csv", "time": [0.0, 4.0]}
+    friction = world.candidate("coulomb_friction", "pivot")
+    for candidate, asked in ((friction, None), (world.localised(friction, when), when)):
+        fitted = SimpleNamespace(setting={candidate: (0.1,)})
+        assert estimator._left(search, fitted, "motion") == asked
+
+
 @pytest.mark.parametrize("better", [False, True])
 def test_what_is_left_without_a_name_is_looked_at_in_finer_steps(monkeypatch, better):
     monkeypatch.setattr(estimator, "lacking", lambda fitted: fitted.setting)
-    monkeypatch.setattr(estimator, "_left", lambda search, fitted, trajectory: trajectory)
+    told = lambda world, trajectory, train, when: trajectory
+    monkeypatch.setattr(estimator.moments, "followed", told)
+    monkeypatch.setattr(estimator, "condition_of", lambda setting: None)
     locate = lambda setting, near: f"{near} in {setting}"
     found = SimpleNamespace(judge=None, smoother=SimpleNamespace(locate=locate))
     fitted = SimpleNamespace(setting="usual steps")

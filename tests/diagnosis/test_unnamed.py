@@ -72,6 +72,7 @@ def finding(candidate, removed=0.4, p=1e-5, written="mjcf"):
         "evidence": {"held_out_error_removed": removed, "p_value": p},
         "adequate": True,
         "depends_on": [],
+        "when": candidate.when,
         "written_as": written,
         "also_possible": [],
     }
@@ -191,6 +192,16 @@ def test_a_curve_that_was_found_leads_the_names_at_its_joint():
     assert only["depends_on"] == ["position:elbow", "velocity:elbow"]
     assert only["written_as"] == "python"
     assert [o["effect"] for o in only["also_possible"]] == ["coulomb_friction"]
+
+
+def test_an_unknown_force_acts_when_its_nearest_name_does():
+    when = {"recording": "1.csv", "time": [0.0, 4.0]}
+    friction = finding(FRICTION)
+    friction[1]["when"] = when
+    [only] = led(WORLD, outcome(smoothed(1.0), 0.9, DEPENDS), [friction], True)
+    assert only["effect"] == "unknown" and only["when"] == when
+    [always] = led(WORLD, outcome(smoothed(1.0), 0.9, DEPENDS), [finding(FRICTION)], True)
+    assert always["effect"] == "unknown" and always["when"] is None
 
 
 def test_of_two_unknown_forces_at_a_joint_the_more_important_one_is_told():

@@ -122,7 +122,7 @@ def test_sets_are_met_without_what_is_left_out():
     assert not any("first" in names(node) for node in nodes) and "both" in names(nodes[0])
 
 
-@pytest.mark.parametrize("limit", [False, True])
+@pytest.mark.parametrize("limit", [False, "that there was not", "that there was"])
 def test_what_made_up_for_an_effect_goes_when_that_joins(limit):
     """But for a limit, of whose absence columns tell nothing."""
     rng, ahead = np.random.default_rng(6), scene()
@@ -131,7 +131,11 @@ def test_what_made_up_for_an_effect_goes_when_that_joins(limit):
     named = {"mimic": mimic, "true": true}
     beam, names = made(named, true - mimic + 0.01 * rest, ahead, inside=["mimic"])
     if limit:
-        beam.columns.options[0].candidate.effect.bounds = True
+        candidate = beam.columns.options[0].candidate
+        if limit == "that there was":
+            candidate.effect.bounds = True
+        else:
+            candidate.nominal = (np.inf,)
         beam = Beam(beam.columns, beam.evidence)
     start, nodes = beam.nodes()
     assert names(start) == {"mimic"}
