@@ -95,12 +95,15 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
 def _undisturbed(search, found, event):
     """(search, found, event): what lasts, searched again without the time of an event, begun with
     what was found. Beside the event, on all windows, the better of the two sets is kept; where
-    neither predicts better than what was found without an event, there is none."""
+    neither predicts better than what was found without an event, or something else acts at times,
+    there is none."""
     search.log(f"  an event: {event.candidate}")
     calm = Identification(
         search.world, transients.calm(search.train, event), search.say, search.log
     )
     again = calm.run(found.fitted.setting)
+    if condition_of(again.fitted.setting):
+        return search, found, None
     again = replace(again, fitted=_earned(calm, again.judge, again.fitted))
     before, after = (
         _everywhere(search, found.judge, some.fitted.setting, event) for some in (found, again)

@@ -16,7 +16,7 @@ from diagnosis.selection.plausibility import cost
 WIDTH, LOOKS = 16, 10  # sets that are carried on, and further effects tried in each in full
 DEPTH = 4  # effects added in one round
 LEAST = 0.01  # loss that an effect must remove in the search
-GLANCES = 8, 0.3  # beginnings of windows that are, s, for effects of which no single row tells
+GLANCES = 8, 0.3  # beginnings of windows that are looked at first, and their length, s
 MORE, EACH = 2, 10  # looks beside the best of those before, more than joints; new ones in each
 
 
@@ -166,25 +166,21 @@ class Beam:
 
 
 def likely(missing, starts):
-    """Of Starts, the best ones of those candidates that explain most alone, or beside the best, a
-    row ahead, or in short windows where no row tells or the motion mostly touches something. Kept
-    are the effects of the setting as well, and waves, which the located force has chosen."""
+    """Of Starts, the best ones of those candidates that explain most, alone or beside the best, a
+    row ahead, or in the beginnings of windows: a row tells of no sensor, and little of a force that
+    comes and goes within a few; a beginning tells little of one that builds up slowly. Kept are the
+    effects of the setting as well, and waves, which the located force has chosen."""
     chain, setting = missing.chain, missing.setting
     chosen = lambda start: start.candidate in setting or start.merges
     kept = [start for start in starts if chosen(start)]
     new = [start for start in starts if not chosen(start)]
-    in_rows, in_windows, some = [], [], []
     rounds = len(chain.channels) + MORE
-    for start in new:
-        (in_windows if chain.touches or chain.apart(start.candidate) else in_rows).append(start)
-    if in_rows:
-        bases = {start: missing.basis(start) for start in in_rows}
-        in_windows += [start for start in in_rows if bases[start] is None]
-        bases = {start: basis for start, basis in bases.items() if basis is not None}
-        some = _by_rows(missing.force, bases, rounds)
-    if in_windows:
-        some += _by_windows(chain.beginnings(*GLANCES), setting, kept, in_windows, rounds)
-    return [*dict.fromkeys([*kept, *some])]  # a wave may be among the best in windows as well
+    bases = {} if chain.touches else {start: missing.basis(start) for start in new}
+    bases = {start: basis for start, basis in bases.items() if basis is not None}
+    some = _by_rows(missing.force, bases, rounds) if bases else []
+    if new:
+        some += _by_windows(chain.beginnings(*GLANCES), setting, kept, new, rounds)
+    return [*dict.fromkeys([*kept, *some])]  # a wave may be among the best as well
 
 
 def _best(gains, kept):
@@ -202,7 +198,7 @@ def _by_rows(target, bases, rounds):
     """The Starts whose bases (n, dofs, p) explain most of a target (n, dofs)."""
     kept, target = {}, target.ravel()
     bases = {start: basis.reshape(len(target), -1) for start, basis in bases.items()}
-    for _ in range(rounds if bases else 0):
+    for _ in range(rounds):
         gains = {start: explained(basis, target) for start, basis in bases.items()}
         best, further = _best(gains, kept)
         kept |= dict.fromkeys(further)

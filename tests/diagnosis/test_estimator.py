@@ -162,6 +162,7 @@ def test_what_lasts_is_searched_again_where_an_event_is_not(monkeypatch, beside,
     monkeypatch.setattr(estimator, "Identification", Search)
     monkeypatch.setattr(estimator.transients, "calm", lambda train, event: "calm")
     monkeypatch.setattr(estimator, "_earned", lambda search, judge, fitted: fitted)
+    monkeypatch.setattr(estimator, "condition_of", lambda setting: None)
     before = Set(setting={"friction": 0.1}, loss=-1.0)
     found = estimator.Found(before, *[None] * 4, beside, *[None] * 3)
     whole = Search("world", "all of it")
@@ -173,6 +174,16 @@ def test_what_lasts_is_searched_again_where_an_event_is_not(monkeypatch, beside,
         assert search.begun_with == {"friction": 0.1}  # begun at nothing it may end anywhere
     else:
         assert search is whole and ended is found
+
+
+def test_there_is_no_event_where_without_its_time_something_else_acts_at_times(monkeypatch):
+    monkeypatch.setattr(estimator, "Identification", Search)
+    monkeypatch.setattr(estimator.transients, "calm", lambda train, event: "calm")
+    monkeypatch.setattr(estimator, "condition_of", lambda setting: "run.csv")
+    before = Set(setting={"friction": 0.1}, loss=-1.0)
+    found = estimator.Found(before, *[None] * 4, {0.1: -2.0, 0.2: -3.0}, *[None] * 3)
+    whole = Search("world", "all of it")
+    assert estimator._undisturbed(whole, found, PUSH) == (whole, found, None)
 
 
 @pytest.mark.parametrize("worth", [True, False])

@@ -85,28 +85,43 @@ def test_what_shows_only_beside_the_best_is_kept(monkeypatch):
     assert {"coulomb_friction", "viscous_damping"} <= kept_of(other, some)
 
 
-def test_what_no_row_tells_is_asked_in_windows(scene, monkeypatch):
-    """A sensor's scale, and everything where the motion mostly touches something."""
+def looked_at(monkeypatch, chain, some):
+    """(names that a look by rows is asked for, those that a look in windows is, what is kept where
+    either keeps the first of them)."""
+    asked = []
+
+    def look(*given):
+        tried = [*next(x for x in reversed(given[:-1]) if isinstance(x, dict | list))]
+        asked.append({start.candidate.effect.name for start in tried})
+        return tried[:1]
+
+    monkeypatch.setattr(beam, "_by_rows", look)
+    monkeypatch.setattr(beam, "_by_windows", look)
+    return asked, likely(MissingForce(chain, {}), some)
+
+
+def test_all_are_looked_at_in_windows_and_where_it_tells_row_by_row(scene, monkeypatch):
+    chain, forces = scene[1], {"coulomb_friction", "mass"}
+    some = starts(scene, "sensor_scale", *forces)
+    asked, kept = looked_at(monkeypatch, chain, some)
+    assert asked == [forces, {"sensor_scale", *forces}]
+    assert {*kept} == {next(s for s in some if s.candidate.effect.name in forces), some[0]}
+    # what changes nothing in the rows
+    monkeypatch.setattr(chain, "missing", lambda setting, rows: np.ones((len(rows), 2)))
+    assert looked_at(monkeypatch, chain, some)[0] == [{"sensor_scale", *forces}]
+
+
+def test_where_the_motion_mostly_touches_something_no_row_tells(scene, monkeypatch):
     world, chain, _ = scene
-    monkeypatch.setattr(beam, "EACH", 1)
-    monkeypatch.setattr(beam, "MORE", 0)
-    each = starts(scene, "sensor_scale", "sensor_bias", "coulomb_friction", "mass", "armature")
-    rows = {"coulomb_friction"}
-    kept = kept_of(scene, each)
-    assert rows < kept and kept - rows <= {"sensor_scale", "sensor_bias"}
     touching = Chain(world, chain.windows, chain.noise)
     free = np.ones(len(chain.trajectory.free), bool)
     touching.start(replace(chain.trajectory, free=free))
-    assert kept_of((world, touching, None), each) == {"coulomb_friction"}
-
-
-def test_what_changes_nothing_in_the_rows_is_asked_in_windows(scene, monkeypatch):
-    _, chain, _ = scene
-    some = starts(scene, "coulomb_friction", "mass")
-    monkeypatch.setattr(chain, "missing", lambda setting, rows: np.ones((len(rows), 2)))
-    asked = lambda short, setting, kept, asked, rounds: asked
-    monkeypatch.setattr(beam, "_by_windows", asked)
-    assert likely(MissingForce(chain, {}), some) == some
+    some = starts(scene, "sensor_scale", "coulomb_friction", "mass", "armature")
+    monkeypatch.setattr(beam, "EACH", 1)
+    monkeypatch.setattr(beam, "MORE", 0)
+    assert kept_of((world, touching, None), some) == {"coulomb_friction"}
+    asked, _ = looked_at(monkeypatch, touching, some)
+    assert asked == [{start.candidate.effect.name for start in some}]
 
 
 def test_of_a_candidate_the_best_share_and_the_best_whole_value_are_kept(scene):
