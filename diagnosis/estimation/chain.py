@@ -35,7 +35,8 @@ class Chain(Ahead):
 
     def __init__(self, world, windows, noise):
         super().__init__(world, windows, noise)
-        self.glances = {}  # {(number, seconds): what effects do in such beginnings}
+        self.glances = {}  # {(number, seconds, rows): what effects do in such beginnings}
+        self.acts = None  # in their rows, {effects: (rows, 2 nv)}, where that is kept
 
     def start(self, trajectory, setting=None):
         super().start(trajectory, setting)
@@ -77,7 +78,8 @@ class Chain(Ahead):
         chosen = [self.windows[i] for i in windowing.evenly(len(self.windows), number)]
         short = Chain(self.world, [windowing.beginning(w, seconds) for w in chosen], self.noise)
         short.start(self.trajectory, self.base)
-        short.beyond = self.glances.setdefault((number, seconds), {})
+        which = number, seconds, short.used.tobytes()
+        short.beyond, short.acts = self.glances.setdefault(which, ({}, {}))
         return short
 
     def _begun(self, windows, step):
@@ -133,9 +135,25 @@ class Chain(Ahead):
     def _along(self, settings, out):
         """Fill in what the chain predicts, the same once."""
         keys = [frozenset(setting.items()) for setting in settings]
-        done = {key: self.missing(s, self.used) for key, s in dict(zip(keys, settings)).items()}
-        grown = {key: self._grown(missing) for key, missing in done.items()}
+        done = {}
+        for key, setting in dict(zip(keys, settings)).items():
+            done[key] = self._lacking(setting, done)
+        grown = {key: self._grown(done[key]) for key in set(keys)}
         out[:] = [grown[key] for key in keys]
+
+    def _lacking(self, setting, done):
+        """missing() of a setting in the rows that are used. Where it is kept, what effects do there
+        is worked out once, beside whatever of the setting located the motion. done: {items of a
+        setting: of those known}."""
+        new = frozenset((c, v) for c, v in setting.items() if c not in self.base)
+        if self.acts is None or not new:
+            return self.missing(setting, self.used)
+        old = frozenset(setting.items()) - new
+        if old not in done:
+            done[old] = self.missing(dict(old), self.used)
+        if new not in self.acts:
+            self.acts[new] = (self.missing(setting, self.used) - done[old]).astype(np.float32)
+        return done[old] + self.acts[new]
 
     def _beyond(self, settings, plain, out):
         """Add what effects do that are more than what happens within a row, beside the setting that
@@ -248,6 +266,7 @@ def _times_mass(model, qpos, qvel):
     data, out = mujoco.MjData(model), np.empty_like(qvel)
     for row, q, v in zip(out, qpos, qvel):
         data.qpos[:] = q
-        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdKinematics(model, data)
+        mujoco.mj_makeM(model, data)
         mujoco.mj_mulM(model, data, row, v)
     return out

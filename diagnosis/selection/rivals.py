@@ -183,5 +183,5 @@ def _alike(judge, missing, candidate, pool, held):
 
 def meet(world, candidate, other):
     """Whether two candidates act at one joint, or either of them everywhere."""
-    mine, theirs = world.joints(candidate.place), world.joints(other.place)
+    mine, theirs = world.moved_by(candidate.place), world.moved_by(other.place)
     return mine is None or theirs is None or bool(mine & theirs)

@@ -146,6 +146,18 @@ class World:
             return {m.actuator_trnid[m.actuator(place.name).id, 0]}
         return None
 
+    def moved_by(self, place):
+        """Ids of the joints at which what acts at a place is a force, or None for all: a body's
+        weight and inertia are that at all joints that carry it."""
+        joints, m = self.joints(place), self.model
+        if place.kind != "body":
+            return joints
+        body, out = m.body(place.name).id, set()
+        while body:
+            out |= {*range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body])}
+            body = m.body_parentid[body]
+        return joints | out
+
     def adds_states(self, candidate):
         """Whether an effect brings coordinates (backlash) or states (bristles) of its own."""
         if not candidate.effect.overrides("build"):

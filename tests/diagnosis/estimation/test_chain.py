@@ -124,6 +124,18 @@ def test_what_is_more_than_a_row_hardly_changes_with_what_stands_beside_it():
     np.testing.assert_allclose(close.residual(some[1:])[0], b, atol=1e-12)  # whatever came before
 
 
+def test_what_effects_do_in_beginnings_is_worked_out_once(here, monkeypatch):
+    world, truth, chain = here
+    mass = {world.candidate("mass", "arm"): (0.6,)}
+    first = chain.beginnings(4, 0.3)
+    expected = Chain.residual(first, [truth, {**truth, **mass}])
+    short = chain.beginnings(4, 0.3)
+    plain, asked = short.missing, []
+    monkeypatch.setattr(short, "missing", lambda s, rows: asked.append(s) or plain(s, rows))
+    np.testing.assert_allclose(short.residual([truth, {**truth, **mass}]), expected, atol=1e-7)
+    assert asked == [{}]  # beside which effects are known
+
+
 def test_coarse_steps_invent_nothing_under_the_effects_that_located_the_motion(here, monkeypatch):
     world, truth, chain = here
     trajectory = Smoother(world, list(chain.trajectory.first)).locate(truth)

@@ -30,6 +30,19 @@ class Named:
 DRY, CURVED = Named("coulomb", 1), Named("stribeck", 4)
 
 
+def test_bodies_meet_at_the_joints_that_carry_both():
+    link = """<body name="{0}"><joint name="of_{0}"/><geom size=".1"/>{1}</body>"""
+    hand = link.format("hand", "")
+    bodies = link.format("arm", hand) + link.format("other", "")
+    world = World(mujoco.MjSpec.from_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"))
+    mass = {name: world.candidate("mass", name) for name in ("arm", "hand", "other")}
+    damping = {name: world.candidate("viscous_damping", f"of_{name}") for name in ("arm", "hand")}
+    meets = lambda a, b: rivals.meet(world, a, b)
+    assert meets(mass["arm"], mass["hand"]) and meets(mass["hand"], damping["arm"])
+    assert not meets(mass["hand"], mass["other"]) and not meets(mass["arm"], damping["hand"])
+    assert meets(damping["arm"], world.candidate("gravity", "world"))
+
+
 def chosen(monkeypatch, fitted, losses, asked=None):
     """(setting's names, {name: names of others}) after classes; losses: {name: unpriced loss} of
     sets of one effect."""

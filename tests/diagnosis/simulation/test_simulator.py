@@ -185,6 +185,11 @@ def test_a_body_that_is_welded_to_a_link_belongs_to_its_joint():
     for body in ("link", "tool", "tip"):
         assert own[body] == {joint["i"], joint["j"]}
     assert own["hand"] == {joint["k"]}
+    # but its weight is felt by every joint that carries it
+    felt = {c.place.name: world.moved_by(c.place) for c in world.candidates}
+    assert felt["tool"] == {joint["i"], joint["j"]}
+    assert felt["hand"] == set(joint.values())
+    assert felt["k"] == {joint["k"]} and felt["world"] is None
 
 
 BALLS = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
