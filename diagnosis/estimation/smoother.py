@@ -211,7 +211,11 @@ class Smoother:
         drift[bad, nv:] = qvel[now][bad] - qvel[after][bad]
         extra = np.zeros((n, nv))
         jump = np.diff(self.qvel, axis=0)[np.flatnonzero(now)]
-        extra[bad] = np.mean(jump[bad] ** 2, axis=0) if bad.any() else 0.0
+        # a row of which nothing is known begins with the velocity that it has in the mean, whatever
+        # came before
+        glides = np.zeros(len(qpos), bool)
+        glides[np.flatnonzero(now)[bad]] = True
+        extra[bad | glides[after]] = np.mean(jump[bad] ** 2, axis=0) if bad.any() else 0.0
         whole = np.zeros((n, 3 * nv, 3 * nv))
         whole[:, : 2 * nv, : 2 * nv], whole[:, : 2 * nv, 2 * nv :] = A, B
         whole[:, 2 * nv :, 2 * nv :] = np.eye(nv)

@@ -75,11 +75,13 @@ class Beam:
         """(node of the model as it is, all nodes met, best first)."""
         start = self.node(self.kept)
         met, beam, before = {start: None}, [start], np.inf
-        for _ in range(DEPTH):
+        for depth in range(DEPTH):
             grown, each = [new for node in beam for new in self._joined(node, met)], {}
             for node in sorted(grown, key=lambda n: n.unpriced):
                 each.setdefault(self._candidates(node), node)
-            beam = list(each.values())[:WIDTH]  # the best of each set of candidates
+            # the best of each set of candidates; of two that make up for each other neither is
+            # better alone, so single effects are all carried on
+            beam = list(each.values())[: WIDTH if depth else None]
             for node in beam:
                 self._reduced(node, met)
             best = min(node.loss for node in met)
@@ -107,7 +109,6 @@ class Beam:
         further = self.free if first else self._looks(node)
         for k, new in zip(further, self.nodes_of([(*node.options, k) for k in further])):
             met[new] = None
-            # of two that make up for each other neither is better alone
             better = first or new.unpriced < node.unpriced - LEAST
             if better and not self._unnamed(k):
                 grown.append(new)

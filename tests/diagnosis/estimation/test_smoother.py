@@ -220,6 +220,27 @@ def test_what_a_model_errs_where_something_touches_is_no_noise(floor, limit):
     assert smoother.position_noise == pytest.approx(NOISE, rel=0.15)
 
 
+@pytest.mark.parametrize("pushed", [0.8, 1.5])
+def test_the_motion_before_a_blow_is_not_bent_to_it(pushed):
+    """The velocity of a row in which a stop is hit is the mean one of that row."""
+    limit = 'limited="true" range="-20 20" solreflimit="0.004 1"'
+    xml = STOPPED.format(floor="", limit=limit)
+    model, rows = mujoco.MjModel.from_xml_string(xml), 60
+    data, qpos, qvel = mujoco.MjData(model), np.empty((rows, 1)), np.empty((rows, 1))
+    data.ctrl[:] = pushed
+    for t in range(rows):
+        qpos[t], qvel[t] = data.qpos, data.qvel
+        mujoco.mj_step(model, data, 20)
+    noisy = qpos + NOISE * np.random.default_rng(0).normal(size=qpos.shape)
+    ctrl, nothing = np.full((rows, 1), pushed), np.full((rows, 1), np.nan)
+    run = Recording("fall.csv", 0.02 * np.arange(rows), noisy, nothing, ctrl)
+    path = Smoother(World(mujoco.MjSpec.from_string(xml)), [run]).locate({})
+    before = np.arange(rows) < np.argmax(path.free)
+    assert before.sum() >= 4
+    np.testing.assert_allclose(path.qvel[before], qvel[before], atol=0.05 * qvel.max())
+    assert abs(path.force[before]).max() < 0.05 * pushed
+
+
 def test_noise_is_between_what_differences_show_and_a_multiple_of_it():
     """Where a model is far off, what is left of the motion is no noise."""
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
