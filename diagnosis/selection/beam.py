@@ -75,17 +75,17 @@ class Beam:
         """(node of the model as it is, all nodes met, best first)."""
         start = self.node(self.kept)
         met, beam, before = {start: None}, [start], np.inf
-        for depth in range(DEPTH):
-            grown, each = [new for node in beam for new in self._joined(node, met)], {}
+        for _ in range(DEPTH):
+            grown, each = self._joined(beam, met), {}
             for node in sorted(grown, key=lambda n: n.unpriced):
                 each.setdefault(self._candidates(node), node)
             # the best of each set of candidates; of two that make up for each other neither is
             # better alone, so single effects are all carried on
-            beam = list(each.values())[: WIDTH if depth else None]
+            beam = list(each.values())[: None if beam == [start] else WIDTH]
             for node in beam:
                 self._reduced(node, met)
             best = min(node.loss for node in met)
-            if best >= before:
+            if best >= before or not beam:
                 break
             before = best
         return start, sorted(met, key=lambda n: n.loss)
@@ -93,26 +93,33 @@ class Beam:
     def ranking(self):
         """[(candidate, loss removed alone, p-value)], most first."""
         start, met, best = self.node(self.kept), {}, {}
-        self._joined(start, met)
+        self._joined([start], met)
         for node in sorted(met, key=lambda n: n.loss):
             candidate = self.columns.options[node.options[-1]].candidate
             p = paired(start.score, node.score).p_value
             best.setdefault(candidate, (candidate, start.loss - node.loss, p))
         return list(best.values())
 
-    def _joined(self, node, met):
-        """[Node] of sets with one effect more than a node that are better; all are met."""
+    def _joined(self, beam, met):
+        """[Node] of sets with one effect more than some nodes that are better; all are met."""
         # first every option in full: what lowers squares most is not what lowers their logarithm
         # most, and what comes first decides what is tried beside it
-        first = node.options == self.kept
-        grown = []
-        further = self.free if first else self._looks(node)
-        for k, new in zip(further, self.nodes_of([(*node.options, k) for k in further])):
+        first, grown = beam[0].options == self.kept, []
+        tries = [(beam[0], k) for k in self.free] if first else self._tries(beam)
+        every = self.nodes_of([(*node.options, k) for node, k in tries])
+        for (node, k), new in zip(tries, every):
             met[new] = None
             better = first or new.unpriced < node.unpriced - LEAST
             if better and not self._unnamed(k):
                 grown.append(new)
         return grown
+
+    def _tries(self, beam):
+        """[(node, option)] that promise most in a first look: LOOKS of each of the best nodes, and
+        as many of all the others together."""
+        each = [[(promised, node, k) for promised, k in self._looks(node)] for node in beam]
+        rest = sorted(sum(each[WIDTH:], []), key=lambda one: one[0])
+        return [(node, k) for _, node, k in sum(each[:WIDTH], []) + rest[: WIDTH * LOOKS]]
 
     def _unnamed(self, k):
         """Whether an option is a curve: it leaves so little that what stands beside it would fill
@@ -148,15 +155,17 @@ class Beam:
         return {k: gain[list(self.columns.options[k].columns)].sum() for k in self.others(node)}
 
     def _looks(self, node):
-        """Indices of the further options that promise most for their price in a first look."""
+        """[(loss promised, index)] of the further options that promise most for their price in a
+        first look."""
         gain, number = self.gains(node), self.evidence.number
-        worth = lambda k: gain[k] / number - PRICE * complexity([self.columns.options[k].candidate])
+        price = lambda k: PRICE * complexity([self.columns.options[k].candidate])
+        promised = {k: node.unpriced - gain[k] / number + price(k) for k in gain}
         best, seen = [], {}
-        for k in sorted(gain, key=worth, reverse=True):
+        for k in sorted(promised, key=promised.get):
             candidate = self.columns.options[k].candidate
             seen[candidate] = seen.get(candidate, 0) + 1
             if seen[candidate] <= 2 and not self._unnamed(k):  # starts of one candidate
-                best.append(k)
+                best.append((promised[k], k))
         return best[:LOOKS]
 
     def setting(self, node):

@@ -108,7 +108,7 @@ def test_of_options_that_promise_the_same_the_simplest_is_tried_first(monkeypatc
     named = {"first": first, "far": second, "near": 1.0 * second}
     beam, names = made(named, first + 0.5 * second, ahead, prices=(0, 2, 1))
     node = beam.node((0,))
-    assert [beam.columns.options[k].candidate.name for k in beam._looks(node)] == ["near"]
+    assert [beam.columns.options[k].candidate.name for _, k in beam._looks(node)] == ["near"]
 
 
 def test_sets_are_met_without_what_is_left_out():
