@@ -101,6 +101,20 @@ def test_two_that_make_up_for_each_other_are_met_where_neither_is_better_alone()
     assert names(nodes[0]) == {"one", "two"}
 
 
+def test_they_are_met_where_others_that_are_better_alone_fill_the_beam(monkeypatch):
+    monkeypatch.setattr(beam_module, "WIDTH", 1)
+    monkeypatch.setattr(beam_module, "LOOKS", 1)
+    rng, ahead = np.random.default_rng(2), scene()
+    one, other, rest = (clustered(rng, ahead, share=0.0) for _ in range(3))
+    two = one + 0.05 * other
+    named = {"one": one, "two": two, "rest": rest}
+    beam, names = made(named, one - two + 0.02 * rest, ahead)
+    start, nodes = beam.nodes()
+    alone = {next(iter(names(n))): n.unpriced for n in nodes if len(n.options) == 1}
+    assert min(alone, key=alone.get) == "rest"
+    assert names(nodes[0]) >= {"one", "two"}
+
+
 def test_of_options_that_promise_the_same_the_simplest_is_tried_first(monkeypatch):
     monkeypatch.setattr(beam_module, "LOOKS", 1)
     rng, ahead = np.random.default_rng(3), scene()
