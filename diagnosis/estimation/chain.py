@@ -35,8 +35,8 @@ class Chain(Ahead):
 
     def __init__(self, world, windows, noise):
         super().__init__(world, windows, noise)
-        self.glances = {}  # {(number, seconds, rows): what effects do in such beginnings}
-        self.acts = None  # in their rows, {effects: (rows, 2 nv)}, where that is kept
+        self.glances = {}  # {(number, seconds, rows): (beyond, acts) of such beginnings}
+        self.acts = None  # {effects: what they do in the rows (rows, 2 nv)}, where that is kept
 
     def start(self, trajectory, setting=None):
         super().start(trajectory, setting)

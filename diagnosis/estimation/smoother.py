@@ -198,7 +198,8 @@ class Smoother:
         A, B = few.linearised(qpos[now], qvel[now], force[now], self.scale, free[now])
         if not runge_kutta(model):
             A, B = _in_own_steps(A, B, (few.case.step - rows.case.step) / 2 / rows.seconds)
-        n, after = len(q), np.flatnonzero(now) + 1
+        begin = np.flatnonzero(now)
+        n, after = len(begin), begin + 1
         with np.errstate(invalid="ignore", over="ignore"):
             moved = windowing.difference(model, qpos[after], q), v - qvel[after]
             drift = np.concatenate(moved, 1) - np.einsum("nij,nj->ni", B, force[now])
@@ -210,11 +211,11 @@ class Smoother:
         drift[bad, :nv] = windowing.difference(model, qpos[after][bad], glide)
         drift[bad, nv:] = qvel[now][bad] - qvel[after][bad]
         extra = np.zeros((n, nv))
-        jump = np.diff(self.qvel, axis=0)[np.flatnonzero(now)]
+        jump = np.diff(self.qvel, axis=0)[begin]
         # a row of which nothing is known begins with the velocity that it has in the mean, whatever
         # came before
         glides = np.zeros(len(qpos), bool)
-        glides[np.flatnonzero(now)[bad]] = True
+        glides[begin] = bad
         extra[bad | glides[after]] = np.mean(jump[bad] ** 2, axis=0) if bad.any() else 0.0
         whole = np.zeros((n, 3 * nv, 3 * nv))
         whole[:, : 2 * nv, : 2 * nv], whole[:, : 2 * nv, 2 * nv :] = A, B

@@ -149,14 +149,14 @@ class World:
     def moved_by(self, place):
         """Ids of the joints at which what acts at a place is a force, or None for all: a body's
         weight and inertia are that at all joints that carry it."""
-        joints, m = self.joints(place), self.model
         if place.kind != "body":
-            return joints
-        body, out = m.body(place.name).id, set()
+            return self.joints(place)
+        m, out = self.model, set()
+        body = m.body(place.name).id
         while body:
             out |= {*range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body])}
             body = m.body_parentid[body]
-        return joints | out
+        return out
 
     def adds_states(self, candidate):
         """Whether an effect brings coordinates (backlash) or states (bristles) of its own."""
