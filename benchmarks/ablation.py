@@ -52,7 +52,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "rounds until nothing is new": {"diagnosis.selection.identification:LEFT": 2.0},
     "all whole values are moved": {"diagnosis.selection.columns:MOVED": 10**6},
     "whatever promises at times": {"diagnosis.selection.moments:CLEARLY": 0.0},
-    "nothing acts at times": {"diagnosis.selection.moments:TOLD": 0},
+    "nothing acts at times": {"diagnosis.selection.moments:CLEARLY": 1e9},
     "acting at times is free": {"diagnosis.selection.criterion:MOMENT": 0},
     "moments stay at windows": {"diagnosis.selection.moments:REACH": 0},
     "columns of several values as they are": {"diagnosis.selection.columns:PASSES": 0},

@@ -16,6 +16,7 @@ import numpy as np
 from diagnosis import findings
 from diagnosis.effects.base import condition_of
 from diagnosis.effects.unmodelled import Unknown
+from diagnosis.estimation.intervals import intervals
 from diagnosis.estimation.smoother import Smoother, Trajectory
 from diagnosis.handover import Check, Handed, accepted
 from diagnosis.recordings.recording import RecordingError
@@ -186,7 +187,7 @@ def _one_curve(search, found, fitted, log):
     """The Fitted set with one curve, its own or another one, in the place of a curve and names of
     its joint, where these are not earned over it: beside a curve any name fits that it makes up
     for."""
-    for curve in [c for c in fitted.setting if isinstance(c.effect, Unknown)]:
+    for curve in _unnamed(fitted.setting):
         joint = curve.place.name
         mine = [c for c in fitted.setting if _at(search.world, c, joint)]
         if len(mine) < 2:
@@ -198,6 +199,11 @@ def _one_curve(search, found, fitted, log):
             log(f"  one curve at {joint}: {alone.loss:.3f} {said(alone.setting)}")
             fitted = alone
     return fitted
+
+
+def _unnamed(setting):
+    """[Candidate] of the curves of a setting."""
+    return [c for c in setting if isinstance(c.effect, Unknown)]
 
 
 def _nameless(search, outcome):
@@ -272,6 +278,16 @@ def _refitted(search, outcome, decides, log, some, out):
     return _earned(search, judge, fitted).setting  # what was earned beside it goes, too
 
 
+def _doubtful(judge, setting):
+    """The name of a setting whose intervals hold what the nominal model has, that which is missed
+    least; None where there is none."""
+    fitted = judge.fit(setting, steps=0)
+    bounds, named = intervals(fitted), physics(setting).difference(_unnamed(setting))
+    some = [c for c in setting if c in named and any(bounds[c])]
+    some = [c for c in some if not findings.certain(c, bounds[c])]
+    return min(some, key=lambda c: without(fitted, c).loss, default=None)
+
+
 def _best_curve(judge, outcome, decides, curves):
     """The setting of one of the curves that the forces at some joints follow, worth the price of a
     force without a name, where a Check says that it predicts better than what is handed over by
@@ -316,7 +332,9 @@ def _hand_over(search, held, kept_back, outcome, log):
     if kept_back is not held:
         decides = Check(world, kept_back, Smoother(world, kept_back), noise)
     judge, refit = found.judge, partial(_refitted, search, outcome, decides, log)
-    outcome.handed = accepted(world, decides, setting, refit, log, told=check)
+    outcome.handed = accepted(
+        world, decides, setting, refit, log, told=check, doubtful=partial(_doubtful, judge)
+    )
     _keep(judge, outcome)
     _curve_instead(judge, outcome, decides, partial(accepted, world, decides, log=log, told=check))
     kept = outcome.fitted.setting

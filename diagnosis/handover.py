@@ -142,13 +142,22 @@ class Check:
         return float(np.sqrt(self._parts(files, self.windows, self.windows).sum()))
 
 
-def accepted(world, check, setting, refit=lambda some, out: some, log=lambda what: None, told=None):
+def accepted(
+    world,
+    check,
+    setting,
+    refit=lambda some, out: some,
+    log=lambda what: None,
+    told=None,
+    doubtful=lambda setting: None,
+):
     """The Handed of what of a setting kept-back recordings do not speak against: neither all of it
     nor any finding makes a prediction worse by more than noise does, from start states as recorded
     and as smoothed too. The window that speaks most against a finding is not counted: one that goes
     another way decides nothing. Where these recordings do not show a finding, those that it was
     found on have decided. refit(setting, out): what is left without one, fitted again; told: the
-    Check of the errors that are told."""
+    Check of the errors that are told; doubtful(setting): the finding that may be nothing, if there
+    is one: that goes, too."""
     nominal = Files.of(world, {})
     before = check.squares(nominal, {}) if setting else None
     nothing, gone = check.scattered(), []
@@ -164,9 +173,13 @@ def accepted(world, check, setting, refit=lambda some, out: some, log=lambda wha
         }
         worst = max(worse, key=worse.get, default=None)
         if worst is None or max(worse[worst], _worse(after, before)) < nothing:
-            errors = {out: (told or check).error(without) for out, without in less.items()}
-            return Handed(setting, files, nominal, errors, gone)
-        log(f"  not handed over: {worst}: worse by {worse[worst]:.4g}, noise {nothing:.4g}")
+            worst = doubtful(setting)
+            if worst is None:
+                errors = {out: (told or check).error(without) for out, without in less.items()}
+                return Handed(setting, files, nominal, errors, gone)
+            log(f"  not handed over: {worst}: it may be nothing")
+        else:
+            log(f"  not handed over: {worst}: worse by {worse[worst]:.4g}, noise {nothing:.4g}")
         gone.append(worst)
         setting = refit(rest[worst], worst)
     return Handed(setting, nominal, nominal, {}, gone)

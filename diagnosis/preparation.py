@@ -10,6 +10,7 @@ import os
 import mujoco
 import numpy as np
 
+from diagnosis.estimation import windowing
 from diagnosis.nominal.model import ModelError, gains_of, load_world, together, with_gains
 from diagnosis.recordings import plausibility
 from diagnosis.recordings import recording as recorded
@@ -17,6 +18,8 @@ from diagnosis.recordings.cleaning import without_defects
 from diagnosis.recordings.column_map import load_layout
 from diagnosis.recordings.layout import Layout
 from diagnosis.recordings.quality import assess, evenly_stamped, told
+
+TINY = 1e-30  # rad² or m²: no error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,31 +58,36 @@ def prepared(
     given = [evenly_stamped(r) for r in given]
     train, held = given[: len(train)], given[len(train) :]
     notes += _runs(world.model, given) + told(given, world.model)
-    train, kept = _kept_back(train) if held else split(train)
+    train, kept = _kept_back(world, train) if held else split(world, train)
     plausibility.enough(train)
     return Prepared(world, train, held or kept, kept, notes)
 
 
-def _kept_back(recordings):
+def _kept_back(world, recordings):
     """(for fitting, to decide what is handed over): as split(); all for both where they are
     short."""
     try:
-        return split(recordings)
+        return split(world, recordings)
     except recorded.RecordingError:
         return recordings, recordings
 
 
-def split(recordings):
+def split(world, recordings):
     """(for fitting, held out): every third recording is kept back, or the last 30 % of each of one
-    or two.
+    or two. One that stands out, which the nominal model misses by more beyond the others than these
+    scatter, is fitted to, and the one before it kept back: what acts in one recording alone is seen
+    there or nowhere.
 
     Such a last part keeps the rows before its `start`: actuator states and delayed controls run on
     from them.
     """
     if len(recordings) >= 3:
-        return [r for i, r in enumerate(recordings) if i % 3 != 2], [
-            r for i, r in enumerate(recordings) if i % 3 == 2
-        ]
+        kept, missed = {*range(2, len(recordings), 3)}, _missed(world, recordings)
+        most = int(np.argmax(missed))
+        others = np.delete(missed, most)
+        if missed[most] - others.max() > np.ptp(others):
+            kept = {i - (i == most) for i in kept}
+        return [[r for i, r in enumerate(recordings) if (i in kept) == back] for back in (0, 1)]
     parts = []
     for recording in recordings:
         cut = int(np.searchsorted(recording.time, recording.time[0] + 0.7 * np.ptp(recording.time)))
@@ -100,6 +108,17 @@ def split(recordings):
         )
         parts += [early, dataclasses.replace(recording, start=max(cut, recording.start))]
     return parts[::2], parts[1::2]
+
+
+def _missed(world, recordings):
+    """How far off the nominal model is in each recording, a while ahead of recorded states: log
+    squared errors, the mean over windows, summed over degrees of freedom."""
+    out = []
+    for windows in map(windowing.consecutive, recordings):
+        gap, known = windowing.gaps(world.model, windows, windowing.predict(world, {}, windows)[0])
+        square = (gap**2).sum(1) / np.maximum(known.sum(1), 1)
+        out.append(np.log(np.clip(square, TINY, 1 / TINY)).mean(0).sum())
+    return out
 
 
 def _recordings(recordings, held_out, model, layout=Layout()):

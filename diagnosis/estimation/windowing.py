@@ -71,6 +71,13 @@ def recorded_starts(model, windows):
     return np.array([s[0][i] for s, i in pick]), np.array([s[1][i] for s, i in pick])
 
 
+def rows_of(when, recordings):
+    """Which rows (n,) of recordings, one after the other, a condition holds in."""
+    own = lambda r: when["recording"] in (None, r.name)
+    inside = lambda r: (when["time"][0] <= r.time) & (r.time <= when["time"][1])
+    return np.concatenate([own(r) & inside(r) for r in recordings])
+
+
 def measured(windows, read=lambda recording: recording.qpos):
     """The recorded rows of every window, (W, T, ...), padded with NaN to the longest."""
     each = [read(w.recording)[w.first : w.last + 1] for w in windows]

@@ -145,10 +145,12 @@ class Identification:
         columns.nearer(nominal, tried)
         evidence = columns.evidence(nominal)
         timed = starts.of([c for c in self.world.candidates if c.effect.timed])
-        when, timed = moments.proposed(columns, evidence, timed)
-        if timed:
-            self.log(f"  at times: {timed[0].candidate}")
-            some = [starts.curve(*curve) for curve in self._curves(setting, when)]
+        when, timed = moments.proposed(columns, evidence, timed, starts)
+        if when:
+            self.log(f"  at times {when}: {len({start.candidate for start in timed})} effects")
+            new = self._curves(setting, when) + self._curves(setting, own=True)
+            known = {candidate for candidate, _ in curves}
+            some = [starts.curve(c, values) for c, values in new if c not in known]
             columns = columns.more(timed + some)
             evidence = columns.evidence(nominal)
         self.looked = max(evidence.different(), 1.0)
@@ -194,15 +196,15 @@ class Identification:
         self.sets = as_good(judged + earlier, best)
         return best
 
-    def _curves(self, setting, when=None):
+    def _curves(self, setting, when=None, own=False):
         """[(candidate, values)] of forces without a name, in joints that no effect of a setting has
         for its place: beside one, every curve is significant, and its size decides in the end. What
         depends on the joint's own speed alone is friction of some kind: names are tried first.
-        when: the condition under which they act."""
+        when: the condition under which they act; own: own speeds too, as under a condition."""
         found = moments.followed(self.world, self.trajectory, self.train, when)
         joints = [self.world.joints(c.place) or () for c in setting]
         taken = {self.world.model.joint(j).name for some in joints for j in some}
-        lasts = lambda d: not when and d.variables == (f"velocity:{d.joint}",)
+        lasts = lambda d: not (when or own) and d.variables == (f"velocity:{d.joint}",)
         found = [d for d in found if d.joint not in taken and not lasts(d)]
         return [(d.candidate, d.values) for d in found[:CURVES]]
 

@@ -1,6 +1,6 @@
 """Effects that act under a condition only: in one recording of several, or from a moment on in all.
 
-when, starts = proposed(columns, evidence, timed)     # of candidates that act under one condition
+when, begun = proposed(columns, evidence, timed, starts)   # of effects that act under one condition
 
 Every column is looked at with windows that count and windows that do not, beside what lasts and in
 its place: what acts at times leaves little that stands out once a lasting effect is fitted to it.
@@ -19,8 +19,8 @@ from diagnosis.selection.judge import problem
 from diagnosis.selection.missing_force import dependences
 from diagnosis.selection.transients import STEADY
 
-CLEARLY = 2.0  # times what any name that lasts promises, that one at times must promise
-TOLD = 6  # effects that are tried under the condition
+CLEARLY = 2.0  # times what any name that lasts removes, that one at times must remove
+LOOKS = 8  # options that are tried in full under each condition, of those that promise most
 STARTS = 2  # of each of them
 CLOSER = 0.25, 0.05  # of a window, by which a moment is moved
 REACH = 4  # such moves, either way
@@ -52,19 +52,12 @@ def conditions(windows):
     return each + [Condition(None, (t, end), begin >= t) for t in np.unique(begin)[1:]]
 
 
-def rows_of(when, recordings):
-    """Which rows (n,) of recordings, one after the other, a condition holds in."""
-    own = lambda r: when["recording"] in (None, r.name)
-    inside = lambda r: (when["time"][0] <= r.time) & (r.time <= when["time"][1])
-    return np.concatenate([own(r) & inside(r) for r in recordings])
-
-
 def followed(world, trajectory, recordings, when=None):
     """The Dependences of the force that is located while a condition holds, on curves that act
     under it; without one, all of the time."""
     if not when:
         return dependences(world, trajectory, recordings)
-    found = dependences(world, trajectory, recordings, rows_of(when, recordings))
+    found = dependences(world, trajectory, recordings, windowing.rows_of(when, recordings))
     return [replace(d, candidate=world.localised(d.candidate, when)) for d in found]
 
 
@@ -77,61 +70,91 @@ def placed(world, candidate, when):
     return world.localised(candidate, when)
 
 
-def proposed(columns, evidence, timed):
-    """(condition, [Start]) of the effects that promise most under the condition under which one
-    promises most, beside the setting of some Columns; (None, []) where no one promises
-    clearly more than any name that lasts. timed: Starts of effects that never last."""
+def proposed(columns, evidence, timed, starts):
+    """(condition, [Start]) of effects that are worth their price under a condition, the one under
+    which an effect removes most beside the setting of some Columns; (None, []) where none removes
+    clearly more than any name that lasts. timed: Starts of effects that never last; starts: the
+    Starts that all come from."""
     if condition_of(columns.setting):  # no two at once
         return None, []
     columns, reference = columns.more(timed), evidence.reference
-    chain, evidence = columns.ahead, columns.evidence(reference)
+    chain = columns.ahead
     each, free = conditions(chain.windows), _free(columns)
     if not each or not free:
         return None, []
-    inside = np.array([np.ones(len(chain.windows)), *(c.inside for c in each)])
-    promise = _promise(columns, evidence, inside)
-    at = lambda o: placed(chain.world, o.candidate, each[0].when)
-    lasts = [promise(o)[0] for o in free if not (o.candidate.effect.timed or o.unnamed)]
-    some = [o for o in free if at(o)]
-    gains = np.array([promise(o)[1:] for o in some]).T
-    comes = gains - PRICE * np.array([complexity([at(o)]) for o in some])
-    best, first = np.unravel_index(np.argmax(comes), comes.shape)
-    if not _clear(gains[best], lasts):
+    always, comes = _looks(columns, columns.evidence(reference), free, each)
+    lasts, *comes = _removed(columns, reference, [always, *comes])
+    removed = [max(some.values(), default=0.0) for some in comes]
+    best = int(np.argmax(removed))
+    if removed[best] <= CLEARLY * max(lasts.values(), default=0.0):
         return None, []
-    when, told = each[best].when, {}
-    if each[best].recording is None:
-        when = _closer(columns, reference, some[first], when)
-    for k in np.argsort(-comes[best]):
-        told.setdefault(some[k].candidate, []).append(_under(chain.world, some[k].start, when))
-    return when, [start for starts in list(told.values())[:TOLD] for start in starts[:STARTS]]
+    when, told, best = each[best].when, {}, comes[best]
+    if when["recording"] is None:
+        when = _closer(columns, reference, max(best, key=best.get), when)
+    price = lambda o: PRICE * complexity([placed(chain.world, o.candidate, when)])
+    for option in sorted(best, key=best.get, reverse=True):
+        if best[option] > price(option):
+            told.setdefault(option.candidate, []).append(option.start)
+    under = (_begun(starts, one, mine, when) for one, mine in told.items())
+    return when, [start for some in under for start in some]
 
 
-def _clear(gains, lasts):
-    """Whether some effect promises clearly more under a condition than any name that lasts: what it
-    costs to name it says nothing of whether something comes and goes."""
-    return max(gains) >= CLEARLY * max(lasts, default=0.0)
+def _begun(starts, candidate, lasting, when):
+    """[Start] of a candidate under a condition: where the best of those that last begin, or, of
+    waves, where the force is that is located meanwhile."""
+    here = placed(starts.world, candidate, when)
+    if lasting[0].merges:
+        return starts.of([here])
+    return [replace(start, candidate=here) for start in lasting[:STARTS]]
 
 
 def _free(columns):
-    """The options of Columns that a row or a few tell all of, but for those of the setting."""
+    """The options with a name of Columns that a row or a few tell all of, but for those of the
+    setting."""
     new = lambda c: c not in columns.setting and not columns.ahead.apart(c)
-    return [o for o in columns.options if new(o.candidate)]
+    return [o for o in columns.options if new(o.candidate) and not o.unnamed]
 
 
-def _promise(columns, evidence, inside):
-    """What an option promises, nats (C,) of a look, beside the setting, where it acts in windows
-    inside (C, W)."""
-    options = columns.options
-    kept = [k for k, o in enumerate(options) if o.candidate in columns.setting]
-    given = problem(columns, kept)
+def _looks(columns, evidence, free, each):
+    """((windows, options) that promise most where they last, [(windows, options)] of those that
+    promise most under each Condition), in a first look."""
+    chain, options = columns.ahead, columns.options
+    given = problem(columns, [k for k, o in enumerate(options) if o.candidate in columns.setting])
     low, high = (np.concatenate([getattr(o, end) for o in options]) for end in ("low", "high"))
+    inside = np.array([np.ones(len(chain.windows)), *(c.inside for c in each)])
     gains = evidence.looks(given, evidence.score(*given).amounts, low, high, inside)
-    return lambda option: gains[:, list(option.columns)].sum(1) / evidence.number
+    lasts = [o for o in free if not o.candidate.effect.timed]
+    comes = [o for o in free if placed(chain.world, o.candidate, each[0].when)]
+
+    def most(gain, some):
+        return sorted(some, key=lambda o: -gain[list(o.columns)].sum())[:LOOKS]
+
+    always, *some = [
+        (i, most(g, comes if k else lasts)) for k, (i, g) in enumerate(zip(inside, gains))
+    ]
+    return always, some
 
 
-def _under(world, start, when):
-    """A Start that acts under a condition."""
-    return replace(start, candidate=placed(world, start.candidate, when))
+def _removed(columns, reference, tried):
+    """[{option: loss that it removes beside the setting}] of options that act in some windows each,
+    [(inside (W,), options)]."""
+    chain, options, parts = columns.ahead, columns.options, columns.parts
+    own = problem(columns, [k for k, o in enumerate(options) if o.candidate in columns.setting])
+    which, acts, given = [*own[0]], [np.ones(len(chain.windows))] * len(own[0]), []
+    for inside, some in tried:
+        for option in some:
+            index = np.arange(len(which), len(which) + len(option.columns))
+            mine = index, option.low, option.high, *option.quadratic()
+            first = np.arange(len(own[0])), *own[1:]
+            given.append([np.concatenate(pair) for pair in zip(first, mine)])
+            which += option.columns
+            acts += [inside] * len(index)
+    array = np.stack([parts[k] * on[:, None, None] for k, on in zip(which, acts)], -1)
+    heavier = chain.heavier(columns.setting, options)[which]
+    evidence = Evidence(chain, columns.residual, array, reference, heavier)
+    left = iter([score.loss for score in evidence.scores(given)])
+    before = evidence.score(np.arange(len(own[0])), *own[1:]).loss
+    return [{option: before - next(left) for option in some} for _, some in tried]
 
 
 def _closer(columns, reference, option, when):
@@ -139,7 +162,8 @@ def _closer(columns, reference, option, when):
     chain = columns.ahead
 
     def left(told):
-        starts = [_under(chain.world, option.start, when) for when in told]
+        here = lambda when: placed(chain.world, option.candidate, when)
+        starts = [replace(option.start, candidate=here(when)) for when in told]
         given = chain, columns.setting, starts, columns.residual
         fine = Columns(*given, seen=dict(columns.seen), known=columns)
         beam = Beam(fine, fine.evidence(reference))

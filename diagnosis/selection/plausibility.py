@@ -214,12 +214,12 @@ def plausible(candidate, usual):
         if kind.startswith("per ") and not candidate.effect.overrides("probes"):
             unit = max(unit, abs(nominal[k]))  # what there is may change by as much
         shift = nominal[k] if candidate.effect.name in AWAY else 0.0
-        further = 1.0 if ratio else passing
+        shape = 0 < candidate.effect.amplitudes <= k
+        further = 1.0 if ratio or shape else passing
         ends = np.array([a, b]) * unit * further + shift if np.isfinite(unit) else (-np.inf, np.inf)
         scale[k] = s * unit if np.isfinite(s * unit) and s * unit > 0 else np.inf
         low[k], high[k] = np.clip([min(ends), max(ends)], parameters[k].low, parameters[k].high)
-        shape = 0 < candidate.effect.amplitudes <= k  # which nothing nominal has
-        if np.isfinite(nominal[k]) and not shape:
+        if np.isfinite(nominal[k]) and not shape:  # of a shape, a nominal value means nothing
             low[k], high[k] = min(low[k], nominal[k]), max(high[k], nominal[k])
     return Prior(np.where(np.isfinite(nominal), nominal, 0.0), scale, low, high)
 

@@ -111,7 +111,10 @@ class Starts:
         """Of evenly spaced groups of starts the one whose force is most like the located one, moved
         to where it is even more so, among those inside what is plausible."""
         t, d = self.trajectory, self.usual.dof(candidate.place)
-        rows = np.flatnonzero(~t.free)
+        acts = ~t.free
+        if candidate.when:
+            acts = acts & windowing.rows_of(candidate.when, self.usual.recordings)
+        rows = np.flatnonzero(acts)
         rows = rows[windowing.evenly(len(rows), STATES)]
         if not len(rows):
             return groups

@@ -74,24 +74,33 @@ def recording(rows, name):
 
 
 def test_split_keeps_back_every_third_or_the_last_part():
-    many = [recording(50, f"{k}") for k in range(7)]
-    train, held = preparation.split(many)
+    many, world = [recording(50, f"{k}") for k in range(7)], World(mujoco.MjSpec.from_string(MASS))
+    train, held = preparation.split(world, many)
     assert [r.name for r in train] == ["0", "1", "3", "4", "6"] and [r.name for r in held] == [
         "2",
         "5",
     ]
-    train, held = preparation.split(many[:1])
+    train, held = preparation.split(world, many[:1])
     assert (
         len(train[0].time) + len(held[0].seen().time) == 50 and 14 <= len(held[0].seen().time) <= 16
     )
     assert held[0].seen().time[0] > train[0].time[-1]
     np.testing.assert_array_equal(held[0].time, many[0].time)  # what led there stays
-    train, held = preparation.split(many[:2])
+    train, held = preparation.split(world, many[:2])
     assert [r.name for r in train] == ["0", "1"] == [r.name for r in held]
     [early], [late] = preparation.split(
-        [dataclasses.replace(many[0], start=40)]
+        world, [dataclasses.replace(many[0], start=40)]
     )  # one that was held out before
     assert len(early.seen().time) == 35 and len(late.seen().time) == 10
+
+
+def test_what_the_model_misses_most_is_fitted_to():
+    """A mass that moves on, at rest in the model: a recording in which it does not is another."""
+    many, world = [recording(50, f"{k}") for k in range(6)], World(mujoco.MjSpec.from_string(MASS))
+    for odd, kept in ((5, ["2", "4"]), (2, ["1", "5"]), (3, ["2", "5"])):
+        jerky = dataclasses.replace(many[odd], qpos=np.abs(5 * many[odd].qpos - 0.5))
+        train, held = preparation.split(world, many[:odd] + [jerky] + many[odd + 1 :])
+        assert [r.name for r in held] == kept and str(odd) in [r.name for r in train]
 
 
 def test_what_a_recording_made_in_python_need_not_have():
@@ -114,6 +123,8 @@ def test_a_folder_that_is_named_like_an_environment(tmp_path, monkeypatch):
         diagnose.diagnose("InvertedPendulum-v4", ["nowhere.csv"])
 
 
+MASS = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="j" type="slide"/>
+<geom size="0.1"/></body></worldbody></mujoco>"""
 INTEGRATOR = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint
 name="j" axis="0 1 0" damping="0.3"/>
   <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0"
@@ -133,8 +144,8 @@ def test_the_held_out_tail_starts_with_the_actuators_where_they_were():
         mujoco.mj_step(model, data, nstep=5)
     rows = np.array(rows)
     whole = Recording("run.csv", rows[:, 0], rows[:, 1:2], rows[:, 2:3], rows[:, 3:])
-    [early], [tail] = preparation.split([whole])
     world = World(mujoco.MjSpec.from_string(INTEGRATOR))
+    [early], [tail] = preparation.split(world, [whole])
     error, _ = reported_error(world, {}, [tail], np.ones(1))
     assert error < 1e-6 and len(windowing.cut([tail], 0.3)) == 2
     assert reported_error(world, {}, [tail.seen()], np.ones(1))[0] > 0.1

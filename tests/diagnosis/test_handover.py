@@ -37,6 +37,18 @@ def test_a_finding_that_predicts_worse_is_not_handed_over(kept_back):
     assert check.error(handed.files) < handed.without[damping]
 
 
+def test_a_finding_that_may_be_nothing_is_not_handed_over(kept_back):
+    """Though nothing speaks against it, and the rest is fitted again."""
+    world, check = kept_back
+    damping, delay = (
+        world.candidate(*c) for c in (("viscous_damping", "pivot"), ("delay", "drive"))
+    )
+    refit = lambda some, out: {c: (0.11,) for c in some}
+    doubtful = lambda setting: delay if delay in setting else None
+    handed = accepted(world, check, {damping: (0.1,), delay: (1e-5,)}, refit, doubtful=doubtful)
+    assert handed.setting == {damping: (0.11,)} and handed.gone == [delay]
+
+
 def test_by_how_much_one_set_predicts_worse_than_another(kept_back):
     world, check = kept_back
     damping = world.candidate("viscous_damping", "pivot")

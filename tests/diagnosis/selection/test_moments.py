@@ -96,13 +96,6 @@ def test_a_moment_is_where_the_simulator_leaves_least():
     assert moments.sharpened(judge, nothing) is nothing
 
 
-def test_a_condition_is_as_clear_as_the_dearest_effect_under_it_makes_it():
-    """A map of friction may show what a cheaper friction only hints at."""
-    assert moments._clear([0.14, 0.43], [0.08, 0.04])
-    assert not moments._clear([0.14, 0.12], [0.08, 0.04])
-    assert moments._clear([0.14], [])
-
-
 def first(recordings, **how):
     """The first finding of a diagnosis."""
     world, held = World(mujoco.MjSpec.from_string(XML)), [recorded("held.csv", 9, **how)]

@@ -200,6 +200,18 @@ def test_a_wave_turns_once_within_the_recorded_travel_at_least(effect, at):
         assert possible(wave, values, prior) == allowed
 
 
+def test_what_passes_may_be_stronger_but_turns_no_more_often():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    usual, lasts = (
+        Usual(world, [recorded("a.csv", 0)], np.ones(1)),
+        world.candidate("cogging", "pivot"),
+    )
+    passes = world.localised(lasts, {"recording": "a.csv", "time": [0.0, 1.0]})
+    always, once = plausible(lasts, usual), plausible(passes, usual)
+    assert once.high[0] == pytest.approx(20 * always.high[0])
+    assert (once.low[1:] == always.low[1:]).all() and (once.high[1:] == always.high[1:]).all()
+
+
 def test_friction_has_fallen_at_the_speed_that_is_usual():
     """What still falls beyond is another law of friction."""
     world, _ = driven_by('<motor name="m" joint="j"/>')

@@ -99,7 +99,7 @@ def test_of_a_usual_size_all_is_taken_away_where_there_is_less(machine):
 
 def rubbing(run, waves):
     """The Trajectory of a joint whose friction has so many waves per radian."""
-    angle = np.linspace(0, 40, 600)
+    angle = np.linspace(0, 40, len(run.time))
     q, v = 0.8 * np.sin(angle)[:, None], 0.8 * np.cos(angle)[:, None]
     force = -np.sign(v) * (0.2 + 0.15 * np.sin(waves * q + 1.0))
     free, sd = np.zeros(len(q), bool), np.full(q.shape, 1e-3)
@@ -119,6 +119,20 @@ def test_a_friction_map_begins_at_the_wave_of_the_located_force(machine):
     assert all(start.merges and len(start.directions) == 3 for start in starts)
     reach = [start.high[0] * start.directions[0, 0] for start in starts]  # all that is plausible
     assert reach == pytest.approx([plausible(friction, usual).high[0]] * len(starts))
+
+
+def test_a_wave_that_passes_begins_at_the_force_that_is_located_meanwhile(machine):
+    world, usual = machine
+    friction, [run] = world.candidate("friction_map", "pivot"), usual.recordings
+    one, other = (rubbing(run, waves) for waves in (6.0, 12.0))
+    half, begun = len(run.time) // 2, {}
+    both = replace(one, force=np.concatenate([one.force[:half], other.force[half:]]))
+    for name, (a, b) in {"first": (0, half - 1), "last": (half, -1)}.items():
+        when = {"recording": run.name, "time": [run.time[a], run.time[b]]}
+        own = Starts(world, {}, usual, trajectory=both).of([world.localised(friction, when)])
+        begun[name] = own[0].base[2] + own[0].directions[0, 2]
+    assert begun["first"] == pytest.approx(6.0, rel=0.1)
+    assert begun["last"] == pytest.approx(12.0, rel=0.1)
 
 
 def test_a_wave_longer_than_the_travel_is_begun_at_one_that_is_plausible(machine):
