@@ -84,7 +84,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
     outcome.event = event
-    outcome.earned = bool(outcome.fitted.setting or outcome.event)
+    outcome.earned = bool(physics(outcome.fitted.setting) or outcome.event)
     say(0.85, "checking what is handed over")
     _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
     if not physics(outcome.fitted.setting):
