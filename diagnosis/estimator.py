@@ -84,7 +84,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
     outcome.event = event
-    outcome.earned = bool(physics(outcome.fitted.setting) or outcome.event)
+    outcome.earned = _earns_something(outcome)
     say(0.85, "checking what is handed over")
     _hand_over(search, held_out or train, kept_back or held_out or train, outcome, log)
     if not physics(outcome.fitted.setting):
@@ -116,6 +116,12 @@ def _undisturbed(search, found, event):
         again = replace(again, fitted=again.judge.fit(found.fitted.setting))
     here = calm.smoother.locate(again.fitted.setting, again.trajectory)
     return calm, replace(again, trajectory=here), event
+
+
+def _earns_something(outcome):
+    """Whether the search found more than a finer time step: what that explains is nothing that is
+    missing, so coloured noise may be all that is left."""
+    return bool(physics(outcome.fitted.setting) or outcome.event)
 
 
 def _everywhere(search, judge, setting, event):
@@ -279,12 +285,10 @@ def _refitted(search, outcome, decides, log, some, out):
 
 
 def _doubtful(judge, setting):
-    """The name of a setting whose intervals hold what the nominal model has, that which is missed
-    least; None where there is none."""
+    """The name of a setting that may be nothing and is missed least; None where none may."""
     fitted = judge.fit(setting, steps=0)
     bounds, named = intervals(fitted), physics(setting).difference(_unnamed(setting))
-    some = [c for c in setting if c in named and any(bounds[c])]
-    some = [c for c in some if not findings.certain(c, bounds[c])]
+    some = [c for c in setting if c in named and findings.may_be_nothing(c, bounds[c])]
     return min(some, key=lambda c: without(fitted, c).loss, default=None)
 
 

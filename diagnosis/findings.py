@@ -179,9 +179,19 @@ def form_of(candidate):
 def certain(candidate, bounds):
     """Whether the interval of some value leaves out the nominal one; of its amplitudes, where an
     effect has such: the rest means nothing without."""
+    return any(not low <= p.nominal <= high for p, (low, high) in _told(candidate, bounds))
+
+
+def may_be_nothing(candidate, bounds):
+    """Whether the one value that is told of an effect has an interval that holds the nominal one.
+    Of several that are told together each may be nothing, and all of them may not."""
+    return len(_told(candidate, bounds)) == 1 and not certain(candidate, bounds)
+
+
+def _told(candidate, bounds):
+    """[(Parameter, (low, high))] of the amplitudes that are told, or of all values."""
     count = candidate.effect.amplitudes or len(candidate.parameters)
-    seen = [(p, b) for p, b in zip(candidate.parameters[:count], bounds) if b is not None]
-    return any(not low <= p.nominal <= high for p, (low, high) in seen)
+    return [(p, b) for p, b in zip(candidate.parameters[:count], bounds) if b is not None]
 
 
 def place_of(candidate):

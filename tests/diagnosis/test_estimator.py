@@ -301,21 +301,35 @@ def test_what_made_up_for_a_finding_that_goes_may_be_another_by_the_same_recordi
     assert outcome.others["gain"] == []
 
 
+def test_a_finer_time_step_alone_is_nothing_earned():
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    step, damping = (
+        world.candidate("time_step", "world"),
+        world.candidate("viscous_damping", "pivot"),
+    )
+    found = lambda *some, event=None: estimator._earns_something(
+        SimpleNamespace(fitted=SimpleNamespace(setting=dict.fromkeys(some)), event=event)
+    )
+    assert not found() and not found(step)
+    assert found(step, damping) and found(damping) and found(event="a push")
+
+
 def test_what_may_be_nothing_is_the_name_missed_least_whose_intervals_hold_the_nominal_value(
     monkeypatch,
 ):
     world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
     of = lambda effect, place="pivot": world.candidate(effect, place)
     damping, friction, spring = map(of, ("viscous_damping", "coulomb_friction", "stiffness"))
-    step, mass = of("time_step", "world"), of("mass", "arm")
+    step, mass, load = of("time_step", "world"), of("mass", "arm"), of("load_friction")
     bounds = {damping: [(0.04, 0.07)], friction: [(0.0, 0.1)], spring: [(0.1, 0.3)]}
     bounds |= {step: [(0.0, 0.01)], mass: [None]}  # no name, and nothing known
+    bounds[load] = [(0.0, 0.4), (0.0, 0.5), None]  # one of the two is there
     loss = {damping: 0.1, friction: 0.5}
     monkeypatch.setattr(estimator, "intervals", lambda fitted: bounds)
     monkeypatch.setattr(estimator, "without", lambda fitted, c: Set(loss=loss[c]))
     judge = SimpleNamespace(fit=lambda setting, steps: None)
     assert estimator._doubtful(judge, dict.fromkeys(bounds)) is damping
-    assert estimator._doubtful(judge, dict.fromkeys([spring, step, mass])) is None
+    assert estimator._doubtful(judge, dict.fromkeys([spring, step, mass, load])) is None
 
 
 @pytest.mark.parametrize(
