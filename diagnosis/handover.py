@@ -172,16 +172,15 @@ def accepted(
             if files.forms[c] in ("mjcf", "python")
         }
         worst = max(worse, key=worse.get, default=None)
-        if worst is None or max(worse[worst], _worse(after, before)) < nothing:
-            worst = doubtful(setting)
-            if worst is None:
-                errors = {out: (told or check).error(without) for out, without in less.items()}
-                return Handed(setting, files, nominal, errors, gone)
-            log(f"  not handed over: {worst}: it may be nothing")
-        else:
-            log(f"  not handed over: {worst}: worse by {worse[worst]:.4g}, noise {nothing:.4g}")
-        gone.append(worst)
-        setting = refit(rest[worst], worst)
+        harmless = worst is None or max(worse[worst], _worse(after, before)) < nothing
+        out = doubtful(setting) if harmless else worst
+        if out is None:
+            errors = {c: (told or check).error(without) for c, without in less.items()}
+            return Handed(setting, files, nominal, errors, gone)
+        harm = f"worse by {worse.get(out, 0.0):.4g}, noise {nothing:.4g}"
+        log(f"  not handed over: {out}: {'it may be nothing' if harmless else harm}")
+        gone.append(out)
+        setting = refit(rest[out], out)
     return Handed(setting, nominal, nominal, {}, gone)
 
 

@@ -21,7 +21,7 @@ from diagnosis.selection.transients import STEADY
 
 CLEARLY = 2.0  # times what any name that lasts removes, that one at times must remove
 LOOKS = 8  # options that are tried in full under each condition, of those that promise most
-STARTS = 2  # of each of them
+STARTS = 2  # of each effect that are tried under the condition in the end
 CLOSER = 0.25, 0.05  # of a window, by which a moment is moved
 REACH = 4  # such moves, either way
 
@@ -82,8 +82,9 @@ def proposed(columns, evidence, timed, starts):
     each, free = conditions(chain.windows), _free(columns)
     if not each or not free:
         return None, []
-    always, comes = _looks(columns, columns.evidence(reference), free, each)
-    lasts, *comes = _removed(columns, reference, [always, *comes])
+    kept = [k for k, o in enumerate(columns.options) if o.candidate in columns.setting]
+    own = problem(columns, kept)
+    lasts, *comes = _removed(columns, reference, own, _looks(columns, reference, own, free, each))
     removed = [max(some.values(), default=0.0) for some in comes]
     best = int(np.argmax(removed))
     if removed[best] <= CLEARLY * max(lasts.values(), default=0.0):
@@ -115,37 +116,30 @@ def _free(columns):
     return [o for o in columns.options if new(o.candidate) and not o.unnamed]
 
 
-def _looks(columns, evidence, free, each):
-    """((windows, options) that promise most where they last, [(windows, options)] of those that
-    promise most under each Condition), in a first look."""
-    chain, options = columns.ahead, columns.options
-    given = problem(columns, [k for k, o in enumerate(options) if o.candidate in columns.setting])
+def _looks(columns, reference, own, free, each):
+    """[(windows (W,), options)] that promise most in a first look beside the setting, whose problem
+    is given: where they last first, then under each Condition."""
+    chain, options, evidence = columns.ahead, columns.options, columns.evidence(reference)
     low, high = (np.concatenate([getattr(o, end) for o in options]) for end in ("low", "high"))
     inside = np.array([np.ones(len(chain.windows)), *(c.inside for c in each)])
-    gains = evidence.looks(given, evidence.score(*given).amounts, low, high, inside)
+    gains = evidence.looks(own, evidence.score(*own).amounts, low, high, inside)
     lasts = [o for o in free if not o.candidate.effect.timed]
     comes = [o for o in free if placed(chain.world, o.candidate, each[0].when)]
-
-    def most(gain, some):
-        return sorted(some, key=lambda o: -gain[list(o.columns)].sum())[:LOOKS]
-
-    always, *some = [
-        (i, most(g, comes if k else lasts)) for k, (i, g) in enumerate(zip(inside, gains))
-    ]
-    return always, some
+    most = lambda gain, some: sorted(some, key=lambda o: -gain[list(o.columns)].sum())[:LOOKS]
+    some = [lasts, *[comes] * len(each)]
+    return [(where, most(gain, which)) for where, gain, which in zip(inside, gains, some)]
 
 
-def _removed(columns, reference, tried):
+def _removed(columns, reference, own, tried):
     """[{option: loss that it removes beside the setting}] of options that act in some windows each,
-    [(inside (W,), options)]."""
+    [(inside (W,), options)]; own: the problem of the setting."""
     chain, options, parts = columns.ahead, columns.options, columns.parts
-    own = problem(columns, [k for k, o in enumerate(options) if o.candidate in columns.setting])
+    first = np.arange(len(own[0])), *own[1:]
     which, acts, given = [*own[0]], [np.ones(len(chain.windows))] * len(own[0]), []
     for inside, some in tried:
         for option in some:
             index = np.arange(len(which), len(which) + len(option.columns))
             mine = index, option.low, option.high, *option.quadratic()
-            first = np.arange(len(own[0])), *own[1:]
             given.append([np.concatenate(pair) for pair in zip(first, mine)])
             which += option.columns
             acts += [inside] * len(index)
@@ -153,7 +147,7 @@ def _removed(columns, reference, tried):
     heavier = chain.heavier(columns.setting, options)[which]
     evidence = Evidence(chain, columns.residual, array, reference, heavier)
     left = iter([score.loss for score in evidence.scores(given)])
-    before = evidence.score(np.arange(len(own[0])), *own[1:]).loss
+    before = evidence.score(*first).loss
     return [{option: before - next(left) for option in some} for _, some in tried]
 
 
