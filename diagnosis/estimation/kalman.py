@@ -14,8 +14,8 @@ ROUNDING = 1e-12  # share added to variances: noise far smaller than these would
 @dataclass(frozen=True)
 class Smoothed:
     """state (T, blocks, n), variance (T, blocks, n) of each component; for the variances' updates
-    process, measurement: pairs (sum of squares, what that would be at the likelihood's optimum),
-    (n,) or (m,).
+    process (of what shares no noise with others), measurement: pairs (sum of squares, what that
+    would be at the likelihood's optimum), (n,) or (m,).
     """
 
     state: np.ndarray
@@ -24,13 +24,12 @@ class Smoothed:
     measurement: tuple
 
 
-def smooth(A, c, Q, y, R, start, spread, counts=None):
+def smooth(A, c, Q, y, R, start, spread):
     """Smooth all blocks.
 
-    A (T, b, n, n), c (T, b, n): from row t to t + 1; Q (T, b, n): variances of its noise. y (T, b,
-    m): the first m components as measured, NaN where not; R (m,). start (b, n), spread (b, n): mean
-    and variances before the first row. The last row's A, c and Q are not used. counts (T, b): the
-    rows that tell R's scores, by default all.
+    A (T, b, n, n), c (T, b, n): from row t to t + 1; Q (T, b, n, n): covariance of its noise. y (T,
+    b, m): the first m components as measured, NaN where not; R (m,). start (b, n), spread (b, n):
+    mean and variances before the first row. The last row's A, c and Q are not used.
     """
     m = y.shape[-1]
     known = np.isfinite(y)
@@ -42,10 +41,10 @@ def smooth(A, c, Q, y, R, start, spread, counts=None):
     r, behind, N, within, D = _backward(A, keep, pushed, P, K, Finv)
     state = predicted + _times(P, r)
     variance = np.einsum("tbii->tbi", P) - within
-    process = (Q[:-1] * r[1:] ** 2).sum((0, 1)), (Q[:-1] * N[1:]).sum((0, 1))
+    own = np.einsum("tbii->tbi", Q[:-1])
+    process = (own * r[1:] ** 2).sum((0, 1)), (own * N[1:]).sum((0, 1))
     u = pushed - _times(np.swapaxes(K, -1, -2), behind)
-    told = known if counts is None else known & counts[..., None]
-    measurement = (u**2 * told).sum((0, 1)), (D * told).sum((0, 1))
+    measurement = (u**2 * known).sum((0, 1)), (D * known).sum((0, 1))
     return Smoothed(state, np.maximum(variance, 0.0), process, measurement)
 
 
@@ -92,7 +91,6 @@ def _forward(A, c, Q, y, known, R, start, spread):
         errors[t] = (y[t] - x[:, :m]) * known[t]
         gains[t] = P[:, :, :m] @ (inverses[t] * pair[t])
         x = _times(A[t], x + _times(gains[t], errors[t])) + c[t]
-        P = A[t] @ (P - gains[t] @ P[:, :m]) @ A[t].transpose(0, 2, 1)
-        P[:, range(n), range(n)] += Q[t]
+        P = A[t] @ (P - gains[t] @ P[:, :m]) @ A[t].transpose(0, 2, 1) + Q[t]
         P = (P + np.swapaxes(P, -1, -2)) / 2
     return xs, Ps, gains, inverses * pair, errors

@@ -8,11 +8,11 @@ trajectory.force, trajectory.force_sd         # (rows, nv)
 x' = f(x, u) + B w with w a random walk in every joint, y = x + noise; Gauss-Newton around a Kalman
 smoother over blocks of rows. Variances of w and of the noise by maximum likelihood, the noise not
 below what differences of the recordings show. Where something touches, no smooth map tells of a
-force.
+force: there a velocity wanders at random, by as much as it was recorded to change.
 """
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -95,12 +95,15 @@ class Smoother:
         lengths = [len(r.time) for r in recordings]
         starts = np.cumsum([0] + lengths)
         self.first = dict(zip(self.recordings, (int(a) for a in starts[:-1])))
-        states = [windowing.states(model, r) for r in recordings]
+        velocities = [_measured_velocity(model, r) for r in recordings]
+        told = [replace(r, qvel=qvel) for r, qvel in zip(recordings, velocities)]
+        states = [windowing.states(model, r) for r in told]
         self.qpos, self.qvel = (np.concatenate(x) for x in zip(*states))
         read = np.isfinite(np.concatenate([r.qpos for r in recordings]))
         self.position = windowing.difference(model, self.qpos, np.where(read, self.qpos, np.nan))
-        self.velocity = np.concatenate([_measured_velocity(model, r) for r in recordings])
+        self.velocity = np.concatenate(velocities)
         self._blocks(starts)
+        self.jumps = self._jumps()
         self.floor = self._floors(recordings)
         self.R = self.floor.copy()
         self.scale = self._scale()
@@ -125,6 +128,15 @@ class Smoother:
         self.last = np.zeros(starts[-1], bool)
         self.last[starts[1:] - 1] = True  # of a recording: nothing follows
         self.before = np.cumsum(~self.last) - 1  # place among the rows that have a next one
+
+    def _jumps(self):
+        """By how much, squared, each velocity (rows, nv) changes as recorded, on the way to the
+        next row and those about it: in differences of positions a blow is spread over as many."""
+        squares = np.zeros_like(self.qvel)
+        squares[:-1] = np.diff(self.qvel, axis=0) ** 2
+        squares[self.last] = 0.0
+        around = np.concatenate([squares[:1], squares, squares[-1:]])
+        return (around[:-2] + around[1:-1] + around[2:]) / 3
 
     def _floors(self, recordings):
         position, velocity = measurement_noise(self.model, recordings)
@@ -169,9 +181,9 @@ class Smoother:
             free = touching(self.model, qpos, REACH * qpos_sd)
             step = self._linear((rows, few), qpos, qvel, force, free)
             for _ in range(UPDATES):
-                found = self._smooth(step, qpos, qvel, seen, ~free)
-                self._update(found, ~free)
-            found = self._smooth(step, qpos, qvel, seen, ~free)
+                found = self._smooth(step, qpos, qvel, seen)
+                self._update(found)
+            found = self._smooth(step, qpos, qvel, seen)
             nv, own = self.model.nv, self.own
             state, deviation = (np.empty((len(qpos), 3 * nv)) for _ in range(2))
             state[self.index[own]] = found.state[own]
@@ -189,8 +201,9 @@ class Smoother:
         return Trajectory(*args)
 
     def _linear(self, maps, qpos, qvel, force, free):
-        """(A, c, extra, seconds) of every row that has a next one: transitions of (q, v, w) about a
-        trajectory; extra velocity variance; its length. maps: RowMaps in the simulator's steps,
+        """(A, c, jumps, seconds) of every row that has a next one: transitions of (q, v, w) about a
+        trajectory; the variance (n, nv) by which a velocity changes on its way, where nothing is
+        known of that; its length. maps: RowMaps in the simulator's steps,
         which tell where the motion goes, and in few of them, for how small changes go on."""
         model, nv, (rows, few) = self.model, self.model.nv, maps
         now = ~self.last
@@ -210,20 +223,14 @@ class Smoother:
         glide = windowing.integrate(model, qpos[now][bad], qvel[now][bad] * seconds[:, None])
         drift[bad, :nv] = windowing.difference(model, qpos[after][bad], glide)
         drift[bad, nv:] = qvel[now][bad] - qvel[after][bad]
-        extra = np.zeros((n, nv))
-        jump = np.diff(self.qvel, axis=0)[begin]
-        # a row of which nothing is known begins with the velocity that it has in the mean, whatever
-        # came before
-        glides = np.zeros(len(qpos), bool)
-        glides[begin] = bad
-        extra[bad | glides[after]] = np.mean(jump[bad] ** 2, axis=0) if bad.any() else 0.0
+        jumps = np.where(bad[:, None], self.jumps[begin], 0.0)
         whole = np.zeros((n, 3 * nv, 3 * nv))
         whole[:, : 2 * nv, : 2 * nv], whole[:, : 2 * nv, 2 * nv :] = A, B
         whole[:, 2 * nv :, 2 * nv :] = np.eye(nv)
-        return whole, np.concatenate([drift, np.zeros((n, nv))], 1), extra, rows.seconds
+        return whole, np.concatenate([drift, np.zeros((n, nv))], 1), jumps, rows.seconds
 
-    def _smooth(self, step, qpos, qvel, seen, apart):
-        A, c, extra, seconds = step
+    def _smooth(self, step, qpos, qvel, seen):
+        A, c, jumps, seconds = step
         nv, (T, b) = self.model.nv, self.index.shape
         follows = self.live & ~self.last[self.index]
         follows[:-1] &= self.live[1:]
@@ -231,9 +238,13 @@ class Smoother:
         at = np.where(follows, self.before[self.index], 0)
         transition = np.where(follows[..., None, None], A[at], np.eye(3 * nv))
         drift = np.where(follows[..., None], c[at], 0.0)
-        noise = np.zeros((T, b, 3 * nv))
-        noise[..., nv : 2 * nv] = extra[at]
-        noise[..., 2 * nv :] = self.walk * seconds[at][..., None]
+        noise, each = np.zeros((T, b, 3 * nv, 3 * nv)), np.arange(nv)
+        far = seconds[at][..., None]
+        # a velocity that wanders at random on its way takes the position along
+        noise[..., each, each] = far**2 / 3 * jumps[at]
+        noise[..., each, nv + each] = noise[..., nv + each, each] = far / 2 * jumps[at]
+        noise[..., nv + each, nv + each] = jumps[at]
+        noise[..., 2 * nv + each, 2 * nv + each] = self.walk * far
         noise[~follows] = 0.0
         seen_qpos, seen_qvel, position, velocity = seen
         gap = windowing.difference(self.model, qpos, seen_qpos)
@@ -245,16 +256,15 @@ class Smoother:
         away = (0.05 * np.std(self.qpos, axis=0).max() + 10 * np.sqrt(self.R[:nv])) ** 2
         spread = np.concatenate([away, np.var(self.qvel, axis=0) + 1e-6, self.scale**2])
         spread = np.tile(spread, (b, 1))
-        return smooth(transition, drift, noise, y, self.R, start, spread, apart[self.index])
+        return smooth(transition, drift, noise, y, self.R, start, spread)
 
-    def _update(self, found, apart):
-        """Move every variance to where its score is nearer to zero. Of the noise, rows apart from
-        what touches tell that; the others count as if they showed the floor."""
+    def _update(self, found):
+        """Move every variance to where its score is nearer to zero."""
         nv = self.model.nv
         ratio = lambda pair: np.clip(pair[0] / np.maximum(pair[1], 1e-300), 1 / MOST, MOST)
         self.walk = np.maximum(self.walk * ratio(found.process)[2 * nv :], 1e-12 * self.scale**2)
         known = found.measurement[1] > 0
-        moved = apart.mean() * self.R * ratio(found.measurement) + (~apart).mean() * self.floor
+        moved = self.R * ratio(found.measurement)
         moved = np.clip(moved, self.floor, LOUDER**2 * self.floor)
         self.R = np.where(known, moved, self.R)
 

@@ -175,16 +175,17 @@ class Beam:
         return {c: v for c, v in moved.items() if c in inside}
 
 
-def likely(missing, starts):
+def likely(missing, starts, alone=False):
     """Of Starts, the best ones of those candidates that explain most, alone or beside the best, a
     row ahead, or in the beginnings of windows: a row tells of no sensor, and little of a force that
     comes and goes within a few; a beginning tells little of one that builds up slowly. Kept are the
-    effects of the setting as well, and waves, which the located force has chosen."""
+    effects of the setting as well, and waves, which the located force has chosen. alone: nothing
+    beside the best is asked for."""
     chain, setting = missing.chain, missing.setting
     chosen = lambda start: start.candidate in setting or start.merges
     kept = [start for start in starts if chosen(start)]
     new = [start for start in starts if not chosen(start)]
-    rounds = len(chain.channels) + MORE
+    rounds = 1 if alone else len(chain.channels) + MORE
     bases = {} if chain.touches else {start: missing.basis(start) for start in new}
     bases = {start: basis for start, basis in bases.items() if basis is not None}
     some = _by_rows(missing.force, bases, rounds) if bases else []

@@ -163,7 +163,7 @@ def _alike(judge, missing, candidate, pool, held):
     near = [c for c in pool if complexity([c]) <= units and meet(chain.world, c, candidate)]
     starts = Starts(chain.world, rest, judge.usual, trajectory=chain.trajectory)
     starts = starts.of([*near, *rest])
-    columns = Columns(chain, rest, likely(missing, starts), known=held)
+    columns = Columns(chain, rest, likely(missing, starts, alone=True), known=held)
     options, evidence = columns.options, columns.evidence(judge.reference)
     kept = [k for k, o in enumerate(options) if o.candidate in rest]
     gap = held.residual + APART * (columns.residual - held.residual)

@@ -221,8 +221,10 @@ def test_what_a_model_errs_where_something_touches_is_no_noise(floor, limit):
 
 
 @pytest.mark.parametrize("pushed", [0.8, 1.5])
-def test_the_motion_before_a_blow_is_not_bent_to_it(pushed):
-    """The velocity of a row in which a stop is hit is the mean one of that row."""
+@pytest.mark.parametrize("measured", [False, True])
+def test_a_blow_bends_neither_the_motion_before_it_nor_the_rest_after(pushed, measured):
+    """A row in which a stop is hit begins with the velocity that it had until then. How it ends
+    shows in positions a row or two later."""
     limit = 'limited="true" range="-20 20" solreflimit="0.004 1"'
     xml = STOPPED.format(floor="", limit=limit)
     model, rows = mujoco.MjModel.from_xml_string(xml), 60
@@ -231,14 +233,18 @@ def test_the_motion_before_a_blow_is_not_bent_to_it(pushed):
     for t in range(rows):
         qpos[t], qvel[t] = data.qpos, data.qvel
         mujoco.mj_step(model, data, 20)
-    noisy = qpos + NOISE * np.random.default_rng(0).normal(size=qpos.shape)
-    ctrl, nothing = np.full((rows, 1), pushed), np.full((rows, 1), np.nan)
-    run = Recording("fall.csv", 0.02 * np.arange(rows), noisy, nothing, ctrl)
+    rng = np.random.default_rng(0)
+    noisy = qpos + NOISE * rng.normal(size=qpos.shape)
+    read = qvel + 0.02 * rng.normal(size=qvel.shape) if measured else np.full((rows, 1), np.nan)
+    run = Recording("fall.csv", 0.02 * np.arange(rows), noisy, read, np.full((rows, 1), pushed))
     path = Smoother(World(mujoco.MjSpec.from_string(xml)), [run]).locate({})
-    before = np.arange(rows) < np.argmax(path.free)
-    assert before.sum() >= 4
-    np.testing.assert_allclose(path.qvel[before], qvel[before], atol=0.05 * qvel.max())
-    assert abs(path.force[before]).max() < 0.05 * pushed
+    until, before = np.arange(rows) <= np.argmax(-np.diff(qvel[:, 0])), ~path.free
+    assert until.sum() >= 4 and before.sum() >= 4
+    np.testing.assert_allclose(path.qvel[until], qvel[until], atol=0.005 * qvel.max())
+    assert abs(path.force[before & until]).max() < 0.05 * pushed
+    rest = np.arange(rows) > until.sum() + (1 if measured else 3)
+    np.testing.assert_allclose(path.qvel[rest], qvel[rest], atol=0.05)
+    np.testing.assert_allclose(path.qpos, qpos, atol=5 * NOISE)
 
 
 def test_noise_is_between_what_differences_show_and_a_multiple_of_it():
@@ -249,7 +255,7 @@ def test_noise_is_between_what_differences_show_and_a_multiple_of_it():
     for more, times in ((100.0, LOUDER), (0.01, 1.0)):
         found = SimpleNamespace(process=np.ones((2, 3)), measurement=(np.full(2, more), np.ones(2)))
         for _ in range(5):
-            smoother._update(found, np.ones(len(smoother.qpos), bool))
+            smoother._update(found)
         np.testing.assert_allclose(smoother.R[:1], times**2 * shown[:1])
 
 

@@ -198,6 +198,8 @@ def test_another_effect_is_begun_at_the_value_that_it_takes_not_near_its_starts(
     fitted = judge.fit({damping: (0.01 + more,)})
     missing = MissingForce(search.screen, {})
     held = rivals._along(search.screen, judge, fitted.setting)
-    monkeypatch.setattr(rivals, "likely", lambda missing, starts: [s for s in starts if s.whole])
+    monkeypatch.setattr(
+        rivals, "likely", lambda missing, starts, alone=False: [s for s in starts if s.whole]
+    )
     [(other, (value,))] = rivals._alike(judge, missing, damping, [back_emf], held)
     assert other is back_emf and value == pytest.approx(more, rel=0.1)
