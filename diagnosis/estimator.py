@@ -79,7 +79,7 @@ def identify(world, train, held_out, kept_back=None, progress=None, log=None):
     fitted, others = _classes(search, found, found.fitted, log, search.candidates)
     if set(fitted.setting) != set(found.fitted.setting):  # what made up for another member goes
         fitted = search.pruned(found.judge, fitted, found.judge.fit({}))
-    fitted = changing(found.judge, fitted)
+    fitted = _as_it_was(search, found.judge, changing(found.judge, fitted))
     others = rivals.together(others, fitted, found.sets)
     say(0.8, "testing for anything left")
     outcome = _checked(search, found, fitted, others, log)
@@ -116,6 +116,24 @@ def _undisturbed(search, found, event):
         again = replace(again, fitted=again.judge.fit(found.fitted.setting))
     here = calm.smoother.locate(again.fitted.setting, again.trajectory)
     return calm, replace(again, trajectory=here), event
+
+
+def _as_it_was(search, judge, fitted):
+    """A Fitted set in which what the recordings do not show of an effect, beside what they show of
+    it, is nominal, unless that is worse: together several may show where none does alone."""
+    bounds = intervals(fitted)
+    for c, values in fitted.setting.items():
+        told = np.array([b is not None for b in bounds[c]])
+        kept = tuple(np.where(told, values, c.nominal).tolist())
+        if told.all() or not told.any() or not np.isfinite(kept).all() or kept == values:
+            continue
+        before, search.seen[c] = search.seen.get(c), told
+        tried = judge.fit({**fitted.setting, c: kept}, steps=3)
+        if search.earned(tried, fitted):
+            search.seen[c] = np.ones(len(told), bool) if before is None else before
+        else:
+            fitted = tried
+    return fitted
 
 
 def _earns_something(outcome):

@@ -111,9 +111,9 @@ class Columns:
         where they tell all of it well."""
         each = [(self.parts[k] / self.ahead.known_noise).ravel() for k in option.columns]
         size, ways = np.linalg.svd(np.stack(each, -1), full_matrices=False)[1:]
-        if size[-1] > SLIGHT * size[0]:
+        if size[-1] >= SLIGHT * size[0]:  # or none of them shows anything
             return None
-        ways = ways * np.maximum(size[-1] / size, SLIGHT)[:, None]
+        ways = ways * np.maximum(size[-1] / np.maximum(size, 1e-300), SLIGHT)[:, None]
         return option, ways, replace(option.start, directions=ways @ option.directions)
 
     def _rough(self):

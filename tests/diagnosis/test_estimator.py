@@ -314,6 +314,26 @@ def test_a_finer_time_step_alone_is_nothing_earned():
     assert found(step, damping) and found(damping) and found(event="a push")
 
 
+@pytest.mark.parametrize("both_show", [False, True])
+def test_a_component_that_no_recording_shows_stays_as_it_was(monkeypatch, both_show):
+    """Beside one that shows; unless without it the set is worse."""
+    world = World(mujoco.MjSpec.from_string(DRIVEN_PENDULUM.format(damping=0.05, mass=0.5)))
+    of = lambda effect, place="pivot": world.candidate(effect, place)
+    push, damping, gravity = (
+        of("external_force", "arm"),
+        of("viscous_damping"),
+        of("gravity", "world"),
+    )
+    bounds = {push: [(0.9, 1.1), None, None], damping: [(0.1, 0.3)], gravity: [None] * 3}
+    setting = {push: (1.0, 0.4, 0.0), damping: (0.2,), gravity: (0.1, 0.0, -9.7)}
+    monkeypatch.setattr(estimator, "intervals", lambda fitted: bounds)
+    search = SimpleNamespace(seen={}, earned=lambda before, after: both_show)
+    judge = SimpleNamespace(fit=lambda setting, steps: Set(setting=setting))
+    found = estimator._as_it_was(search, judge, Set(setting=setting)).setting
+    assert found == {**setting, push: (1.0, 0.4 if both_show else 0.0, 0.0)}
+    assert search.seen[push].tolist() == [True, both_show, both_show]  # no later fit moves them
+
+
 def test_what_may_be_nothing_is_the_name_missed_least_whose_intervals_hold_the_nominal_value(
     monkeypatch,
 ):

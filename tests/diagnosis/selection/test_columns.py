@@ -1,6 +1,7 @@
 """Columns against differences of stock simulations, and what is offered at all."""
 
 import copy
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -12,7 +13,7 @@ from diagnosis.estimation.smoother import Smoother
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import Evidence
 from diagnosis.selection.plausibility import Usual, plausible
-from diagnosis.selection.starts import Starts
+from diagnosis.selection.starts import Start, Starts
 from diagnosis.simulation.simulator import World
 
 
@@ -168,3 +169,17 @@ def test_hidden_states_begin_as_the_setting_alone_has_them(scene):
     Columns(other, setting, Starts(world, setting, usual).of([friction, damping]))
     assert {begun is setting for number, begun in asked if number == 2} == {True}
     assert {begun for number, begun in asked if number == 1} == {None}
+
+
+def test_what_columns_of_one_effect_tell_apart_is_finite_where_they_tell_nothing():
+    start = Start(None, np.zeros(2), np.eye(2), np.zeros(2), np.ones(2), None)
+    option = SimpleNamespace(columns=(0, 1), start=start, directions=start.directions)
+    rows = np.random.default_rng(0).normal(size=(3, 5, 1))
+    turned = lambda *parts: Columns._turned(
+        SimpleNamespace(parts=parts, ahead=SimpleNamespace(known_noise=np.ones(1))), option
+    )
+    assert turned(0 * rows, 0 * rows) is None  # as those of simulations that are all lost
+    assert turned(rows, rows[::-1]) is None
+    _, ways, along = turned(rows, 0 * rows)
+    assert np.isfinite(ways).all() and np.isfinite(along.directions).all()
+    assert abs(np.linalg.det(ways)) > 0
