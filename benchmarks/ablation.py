@@ -57,6 +57,7 @@ RULES = {  # "a rule": {"diagnosis.package.module:CONSTANT": value that switches
     "moments stay at windows": {"diagnosis.selection.moments:REACH": 0},
     "columns of several values as they are": {"diagnosis.selection.columns:PASSES": 0},
     "no coarse steps": {"diagnosis.simulation.rows:STEPS": 1000},
+    "no minimum elsewhere": {"diagnosis.selection.judge:FARTHER": 0.0},
     "new columns in every step": {"diagnosis.selection.judge:TRUE": -1.0},
     "whole steps only": {"diagnosis.selection.judge:THIRDS": 1},
     "any difference on kept-back recordings": {"diagnosis.handover:SCATTER": 0.0},

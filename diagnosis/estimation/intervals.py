@@ -52,7 +52,7 @@ def without_step(fitted, index):
     evidence = kind(columns.ahead, columns.residual, stack)
     every = np.arange(p + 1)
     wide, amounts = half_widths(evidence, every)
-    products, weight = _weighted(evidence, every)
+    products, weight = weighted(evidence, every)
     whole = products.weighed(weight).sum(0)[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     even = whole / np.outer(scale, scale)
@@ -66,7 +66,7 @@ def without_step(fitted, index):
 
 def half_widths(evidence, index):
     """Half widths and remaining Gauss-Newton moves (p,) of columns index (p,), amounts zero."""
-    products, weight = _weighted(evidence, index)
+    products, weight = weighted(evidence, index)
     each = products.weighed(weight)
     scale = np.sqrt(np.maximum(np.diag(each.sum(0))[1:], 1e-300))
     gram, score = each[:, 1:, 1:] / np.outer(scale, scale), each[:, 1:, 0] / scale
@@ -92,8 +92,9 @@ def half_widths(evidence, index):
     return half / scale, moves / scale
 
 
-def _weighted(evidence, index):
-    """(Products of columns index (p,), start states free; weights (G, cells)), amounts zero."""
+def weighted(evidence, index):
+    """(Products of an Evidence's residual and columns index (p,), start states free; weights (G,
+    cells) at which least squares lowers the loss), amounts zero."""
     none = np.zeros(len(index))
     products = evidence.freed(index, none)
     return products, evidence.weighed(evidence.square_of(products, none))

@@ -246,10 +246,10 @@ class Identification:
 
     @staticmethod
     def further(judge, fitted):
-        """Fitted with more steps, if that predicts better what is left out too: what they lower is
-        the error of what they are fitted to."""
+        """Fitted with more steps, or elsewhere, if that predicts better what is left out too: what
+        steps lower is the error of what they are fitted to."""
         more = judge.fit(fitted.setting)
-        return more if more.settled and more.loss < fitted.loss else fitted
+        return judge.elsewhere(more if more.settled and more.loss < fitted.loss else fitted)
 
     def finer(self, judge, fitted):
         """Fitted beside a finer time step, if that is better: what made up for the simulator's own

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from diagnosis.estimation.intervals import weighted
 from diagnosis.selection.columns import Columns
 from diagnosis.selection.criterion import BEYOND, PRICE, Evidence, Score, complexity, paired
 from diagnosis.selection.plausibility import at_limit, cost, plausible
@@ -18,6 +19,7 @@ from diagnosis.selection.starts import Starts
 STEPS = 6  # Gauss-Newton steps of a refit, at most
 DONE = 2e-3  # loss that another step would still remove, from which on a refit is done
 TRUE = 0.5  # of what columns tell of a step, by which it may differ and they are carried along
+FARTHER = 0.25  # scales of priors, by which values are moved to look for another minimum
 THIRDS = 3  # shares of a step that are tried
 
 
@@ -115,10 +117,37 @@ class Judge:
                 break
         return best, as_told
 
+    def elsewhere(self, fitted):
+        """A Fitted set, or a better one that is begun farther along what its columns tell least of:
+        where effects make up for each other, or something touches, a loss has several minima."""
+        columns = fitted.columns
+        step = _least_told(fitted)
+        begun = [moved_setting(columns, way * step) for way in (-1, 1)] if step.any() else []
+        tries = [self.fit(some, steps=3) for some in begun if np.isfinite(self.cost(some))]
+        best = min([fitted, *tries], key=lambda f: f.loss if f.settled else np.inf)
+        return best if best is fitted else self.fit(best.setting)
+
     def cost(self, setting):
         """Minus the log prior density of a setting's values, nats; infinite where they are not
         possible."""
         return sum(cost(c, v, plausible(c, self.usual)) for c, v in setting.items())
+
+
+def _least_told(fitted):
+    """Amounts (p,) of a Fitted set's columns that move its values, in scales of their priors,
+    where these are told least, by FARTHER; none of what has no scale."""
+    options = fitted.columns.options
+    index = np.array([i for o in options for i in o.columns], int)
+    each = [abs(row / o.prior.scale).max() for o in options for row in o.directions]
+    plain = [not (o.merges or o.candidate.effect.numerical) for o in options for _ in o.directions]
+    size = np.array(each) * plain
+    moves, out = np.flatnonzero(size > 0), np.zeros(len(index))
+    if len(moves):
+        products, weight = weighted(fitted.evidence, index[moves])
+        told = products.weighed(weight).sum(0)[1:, 1:] / np.outer(size[moves], size[moves])
+        least = np.linalg.eigh(told)[1][:, 0]
+        out[moves] = FARTHER * least / abs(least).max() / size[moves]
+    return out
 
 
 def nominal(option):

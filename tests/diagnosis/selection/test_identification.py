@@ -148,8 +148,11 @@ def test_a_refit_with_more_steps_has_to_predict_better_what_is_left_out(
 ):
     first = fitted(search, ["coulomb_friction"], -1.0)
     more = fitted(search, ["coulomb_friction"], loss, settled)
-    judge = SimpleNamespace(fit=lambda setting: more)
-    assert search.further(judge, first) is (more if kept else first)
+    other = fitted(search, ["coulomb_friction"], -9.0)
+    asked = []
+    judge = SimpleNamespace(fit=lambda setting: more, elsewhere=lambda f: asked.append(f) or other)
+    assert search.further(judge, first) is other  # and from what is better it looks elsewhere
+    assert asked == [more if kept else first]
 
 
 @pytest.mark.parametrize("loss, kept", [(-1.1, True), (-0.5, False)])

@@ -12,7 +12,7 @@ from diagnosis.estimation.smoother import Smoother
 from diagnosis.recordings.recording import Recording
 from diagnosis.selection import rivals
 from diagnosis.selection.criterion import Score, paired
-from diagnosis.selection.judge import Judge, without
+from diagnosis.selection.judge import FARTHER, Judge, _least_told, moved_setting, without
 from diagnosis.selection.missing_force import MissingForce
 from diagnosis.selection.plausibility import Usual, plausible
 from diagnosis.simulation.simulator import World
@@ -248,3 +248,58 @@ def test_a_late_sensor_is_told_beside_a_late_drive():
     friction = judge.fit({world.candidate("coulomb_friction", "pivot"): (0.01,)}, steps=0)
     [named] = friction.setting
     assert rivals._late(*some, friction, named) == []
+
+
+def test_what_columns_tell_least_of_is_moved_a_quarter_of_a_priors_scale():
+    """Not a time step, which has none that a machine gives."""
+    judge = judge_of(friction=0.05)
+    of = judge.ahead.world.candidate
+    friction, gain, step = (
+        of("coulomb_friction", "pivot"),
+        of("gain", "drive"),
+        of("time_step", "world"),
+    )
+    setting = {friction: (0.05,), gain: (1.0,), step: (0.001,)}
+    fitted = judge.fit(setting, steps=0)
+    moved = moved_setting(fitted.columns, _least_told(fitted))
+    assert moved[step] == setting[step]
+    shares = [
+        abs(moved[c][0] - v[0]) / plausible(c, judge.usual).scale[0] for c, v in setting.items()
+    ]
+    assert max(shares[:2]) == pytest.approx(FARTHER, rel=1e-6)
+    loss = lambda some: judge.fit(some, steps=0).evidence.plain()
+    other = {
+        friction: (0.05 + FARTHER * plausible(friction, judge.usual).scale[0],),
+        gain: (1.0,),
+        step: (0.001,),
+    }
+    assert loss(moved) < loss(other)  # as far, in a direction that is told better
+
+
+@pytest.mark.parametrize(
+    "losses, settled, chosen",
+    [
+        ((-1.2, -1.5), True, 1),
+        ((-0.5, -0.9), True, None),
+        ((-1.2, -1.5), False, None),
+    ],
+)
+def test_of_two_minima_the_lower_one_is_kept(monkeypatch, losses, settled, chosen):
+    judge, tries = judge_of(), []
+    damping = judge.ahead.world.candidate("viscous_damping", "pivot")
+    first = judge.fit({damping: (0.05,)}, steps=0)
+    sets = [SimpleNamespace(loss=x, settled=settled, setting=k) for k, x in enumerate(losses)]
+    more = SimpleNamespace()
+
+    def fit(setting, steps=None):
+        if steps is None:
+            assert setting == chosen  # the better one, with more steps
+            return more
+        tries.append(setting[damping][0])
+        return sets[len(tries) - 1]
+
+    monkeypatch.setattr(judge, "fit", fit)
+    monkeypatch.setattr(type(first), "loss", -1.0)
+    found = judge.elsewhere(first)
+    assert found is (first if chosen is None else more)
+    assert min(tries) < 0.05 < max(tries)
