@@ -121,8 +121,9 @@ def _undisturbed(search, found, event):
 def _as_it_was(search, judge, fitted):
     """A Fitted set in which what the recordings do not show of an effect, beside what they show of
     it, is nominal, unless that is worse: together several may show where none does alone."""
-    bounds = intervals(fitted)
-    for c, values in fitted.setting.items():
+    several = {c: values for c, values in fitted.setting.items() if len(values) > 1}
+    bounds = intervals(fitted) if several else {}
+    for c, values in several.items():
         told = np.array([b is not None for b in bounds[c]])
         kept = tuple(np.where(told, values, c.nominal).tolist())
         if told.all() or not told.any() or not np.isfinite(kept).all() or kept == values:

@@ -203,8 +203,8 @@ class Smoother:
     def _linear(self, maps, qpos, qvel, force, free):
         """(A, c, jumps, seconds) of every row that has a next one: transitions of (q, v, w) about a
         trajectory; the variance (n, nv) by which a velocity changes on its way, where nothing is
-        known of that; its length. maps: RowMaps in the simulator's steps,
-        which tell where the motion goes, and in few of them, for how small changes go on."""
+        known of that; its length, s. maps: RowMaps in the simulator's steps, which tell where the
+        motion goes, and in few of them, for how small changes go on."""
         model, nv, (rows, few) = self.model, self.model.nv, maps
         now = ~self.last
         q, v = rows.ahead(np.arange(now.sum()), qpos[now], qvel[now], force[now])
@@ -239,12 +239,12 @@ class Smoother:
         transition = np.where(follows[..., None, None], A[at], np.eye(3 * nv))
         drift = np.where(follows[..., None], c[at], 0.0)
         noise, each = np.zeros((T, b, 3 * nv, 3 * nv)), np.arange(nv)
-        far = seconds[at][..., None]
+        jumps, seconds = jumps[at], seconds[at][..., None]
         # a velocity that wanders at random on its way takes the position along
-        noise[..., each, each] = far**2 / 3 * jumps[at]
-        noise[..., each, nv + each] = noise[..., nv + each, each] = far / 2 * jumps[at]
-        noise[..., nv + each, nv + each] = jumps[at]
-        noise[..., 2 * nv + each, 2 * nv + each] = self.walk * far
+        noise[..., each, each] = seconds**2 / 3 * jumps
+        noise[..., each, nv + each] = noise[..., nv + each, each] = seconds / 2 * jumps
+        noise[..., nv + each, nv + each] = jumps
+        noise[..., 2 * nv + each, 2 * nv + each] = self.walk * seconds
         noise[~follows] = 0.0
         seen_qpos, seen_qvel, position, velocity = seen
         gap = windowing.difference(self.model, qpos, seen_qpos)
